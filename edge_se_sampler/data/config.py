@@ -1,0 +1,25 @@
+"""What can be set of the data manager. Torch-free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+from edge_se_sampler.protocol import InstantiateConfig, PixelSamplerConfig
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+
+
+@dataclass(frozen=True)
+class VanillaDataManagerConfig(InstantiateConfig):
+    """Images in memory, pixels chosen by a pixel sampler."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.data.datamanager:VanillaDataManager"
+
+    data: Path | None = None
+    """The Blender folder; --data does the same."""
+    train_num_rays_per_batch: int | None = None
+    """Rays of a training step; left out, the model's size decides."""
+    pixel_sampler: PixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
+    """Which pixels are trained on. In Python any host's config may stand here, nerfstudio's own included."""
+

@@ -1,0 +1,113 @@
+"""Images in memory -> the rays and pixels of a training step, with nerfstudio's names."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edge_se_sampler.cameras import Cameras, RayBundle, RayGenerator
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.config import VanillaDataManagerConfig
+from edge_se_sampler.datamanager import SamplerHooks
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+
+
+class DataManager:
+    """Holds the training images and asks a pixel sampler which of their pixels to train on.
+
+    Args:
+        config: its settings, train_num_rays_per_batch resolved.
+        views: the training views.
+        device: of rays and batches; the images stay on the CPU as uint8.
+        background_color: RGB behind transparent pixels, for samplers that look at colours.
+    """
+
+    def __init__(
+        self,
+        config: VanillaDataManagerConfig,
+        *,
+        views: Views,
+        device: torch.device | str = "cpu",
+        background_color: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> None:
+        self.config = config
+        self.device = device
+        self.image_batch = image_batch(views)
+        self.train_ray_generator = RayGenerator(cameras_of(views).to(device))
+        # a host's sampler may write into its config
+        self.train_pixel_sampler = copy.copy(config.pixel_sampler).setup(
+            num_rays_per_batch=config.train_num_rays_per_batch, background_color=background_color
+        )
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """The rays of a training step and their pixels: "image" (N, 3|4) in [0, 1], "indices" (N, 3), ..."""
+        batch = self.train_pixel_sampler.sample(self.image_batch)
+        batch["image"] = unit_interval(batch["image"]).to(self.device)
+        return self.train_ray_generator(batch["indices"]), batch
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
+        """None of its own."""
+        return []
+
+
+class VanillaDataManager(SamplerHooks, DataManager):
+    """The data manager of the standalone program."""
+
+    def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
+        """(n,) squared errors of the model's fine colours, in training mode."""
+        return model.squared_error(model(ray_bundle), unit_interval(batch["image"]).to(self.device))
+
+    def before_iteration(self, func: Any) -> TrainingCallback:
+        """func(step=...) before every training iteration."""
+        return TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], func)
+
+
+def unit_interval(image: Tensor) -> Tensor:
+    """Pixels as float in [0, 1]; uint8 is divided by 255."""
+    return image.float() / 255 if image.dtype == torch.uint8 else image
+
+
+def image_batch(views: Views) -> dict[str, Any]:
+    """All views as nerfstudio's loaders hand them on: stacked, or lists where sizes differ.
+
+    Raises:
+        InputError: no views.
+    """
+    if not views.images:
+        raise InputError("there are no training views; transforms_train.json must list at least one frame")
+    channels = max(image.shape[2] for image in views.images)
+    images = [torch.from_numpy(_with_channels(image, channels)) for image in views.images]
+    batch: dict[str, Any] = {"image": images}
+    if views.masks is not None:
+        batch["mask"] = [torch.from_numpy(mask)[..., None] for mask in views.masks]
+    if len({image.shape for image in images}) == 1:
+        batch = {key: torch.stack(value) for key, value in batch.items()}
+    return batch | {"image_idx": torch.arange(len(images))}
+
+
+def _with_channels(image: np.ndarray, channels: int) -> np.ndarray:
+    """Opaque alpha added to an RGB image among RGBA ones."""
+    if image.shape[2] == channels:
+        return image
+    return np.concatenate((image, np.full_like(image[..., :1], 255)), axis=2)
+
+
+def cameras_of(views: Views) -> Cameras:
+    """The views' cameras."""
+    sizes = torch.tensor([image.shape[:2] for image in views.images])
+    focal = torch.from_numpy(views.focal).float()
+    principal = torch.from_numpy(views.principal).float()
+    return Cameras(
+        camera_to_worlds=torch.from_numpy(views.camera_to_worlds).float(),
+        fx=focal[:, :1],
+        fy=focal[:, 1:],
+        cx=principal[:, :1],
+        cy=principal[:, 1:],
+        width=sizes[:, 1:],
+        height=sizes[:, :1],
+    )

@@ -1,0 +1,75 @@
+"""3-vectors and 3x3 maps, component first, with no BLAS.
+
+A vector is an array (3, ...) and a linear map an array (3 rows, 3 columns, ...); trailing axes broadcast. BLAS
+kernels, `np.linalg`, `np.einsum` and numpy's own sin, cos and power choose instructions by the CPU and differ in
+their last bits. Sums, products, quotients and square roots of float64 do not: IEEE 754 rounds each of them
+correctly. So nothing else touches a made pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def vector(values: ArrayLike) -> Array:
+    """The same numbers as a float64 array."""
+    return np.asarray(values, dtype=np.float64)
+
+
+def dot(a: Any, b: Any) -> Array:
+    """Inner product (...) of two vectors (3, ...)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product (3, ...) of two vectors (3, ...)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def length(a: Array) -> Array:
+    """Euclidean length (...) of a vector (3, ...)."""
+    return np.sqrt(dot(a, a))
+
+
+def unit(a: ArrayLike) -> Array:
+    """The vector (3, ...) scaled to length 1."""
+    a = vector(a)
+    return a / length(a)
+
+
+def apply(linear: Array, v: Any) -> Array:
+    """The map (3, 3, ...) applied to the vector (3, ...)."""
+    return np.stack([dot(linear[0], v), dot(linear[1], v), dot(linear[2], v)])
+
+
+def compose(a: Array, b: Array) -> Array:
+    """The map (3, 3, ...) that does `b` first, then `a`."""
+    return np.stack([apply(a, b[:, 0]), apply(a, b[:, 1]), apply(a, b[:, 2])], axis=1)
+
+
+def affine(linear: Array, translation: Array) -> Array:
+    """The affine map (3, 4, ...) x -> linear x + translation."""
+    return np.concatenate([linear, translation[:, None]], axis=1)
+
+
+def inverse_affine(m: Array) -> Array:
+    """Inverse (3, 4, ...) of an affine map (3, 4, ...), in closed form."""
+    x, y, z = m[:, 0], m[:, 1], m[:, 2]
+    rows = np.stack([cross(y, z), cross(z, x), cross(x, y)])
+    linear = rows / dot(x, rows[0])
+    return affine(linear, -apply(linear, m[:, 3]))
+
+
+def rotation(axis: ArrayLike, degrees: float) -> Array:
+    """Right-handed turn (3, 3) about an axis of any length (Rodrigues)."""
+    x, y, z = unit(axis)
+    angle = math.radians(degrees)
+    k = vector([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * compose(k, k)

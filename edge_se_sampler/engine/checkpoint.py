@@ -1,0 +1,119 @@
+"""Checkpoints that are whole or not there.
+
+A file is one line of text, "edge-se-checkpoint 1 <sha256 of the rest>", and then what torch.save wrote. Written to
+a temporary file, flushed to the disk, renamed: a process killed at any moment leaves the old file or the new one.
+Loaded with weights_only=True, so a pickle in it is refused, never run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from edge_se_sampler.errors import InputError
+
+MAGIC = b"edge-se-checkpoint 1 "
+_NAME = re.compile(r"step-(\d{9,})\.ckpt")
+
+
+def checkpoint_path(folder: Path, step: int) -> Path:
+    """Where the checkpoint after a step (0, 1, ...) lies."""
+    return folder / f"step-{step:09d}.ckpt"
+
+
+def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
+    """Write a checkpoint, then delete the older ones.
+
+    Raises:
+        InputError: it cannot be written (disk full, no permission); older ones are untouched.
+    """
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    payload = buffer.getvalue()
+    path = checkpoint_path(folder, step)
+    write_atomically(path, MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
+    for older in _checkpoints(folder):
+        if older != path and _step(older) < step:
+            older.unlink(missing_ok=True)
+    return path
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file by new content that is safely on the disk, or leave it as it was.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        with contextlib.suppress(PermissionError):  # a folder that cannot be opened cannot be flushed
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+    except OSError as problem:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        reason = problem.strerror or str(problem)
+        raise InputError(f"{path}: cannot be written ({reason}); what was there before is untouched") from problem
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint with the highest step.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = _checkpoints(folder)
+    if not found:
+        raise InputError(f"{folder}: no checkpoint (step-*.ckpt); the run ended before its first was saved")
+    return max(found, key=_step)
+
+
+def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
+    """Read a checkpoint and make sure that it is whole and belongs to this configuration.
+
+    Raises:
+        InputError: unreadable, truncated or changed since it was written, not a checkpoint, or saved under another
+            configuration.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as problem:
+        raise InputError(f"{path}: cannot be read ({problem.strerror})") from problem
+    header, _, payload = content.partition(b"\n")
+    if not header.startswith(MAGIC):
+        raise InputError(f"{path}: not a checkpoint of edge-se; point to a run folder that edge-se train made")
+    if header[len(MAGIC) :] != hashlib.sha256(payload).hexdigest().encode():
+        raise InputError(f"{path}: truncated or changed since it was saved (checksum); restore it or train again")
+    try:
+        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as problem:
+        raise InputError(f"{path}: holds more than tensors and numbers (a pickle), which is never loaded") from problem
+    if not isinstance(state, dict) or state.get("config_digest") != config_digest:
+        raise InputError(f"{path}: saved under another configuration than the run's config.json; do not mix runs")
+    return state
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    return [path for path in folder.glob("step-*.ckpt") if _NAME.fullmatch(path.name)]
+
+
+def _step(path: Path) -> int:
+    match = _NAME.fullmatch(path.name)
+    assert match
+    return int(match.group(1))

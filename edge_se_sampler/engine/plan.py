@@ -1,0 +1,79 @@
+"""What a config leaves open, decided by the data: model size, rays, iterations, learning rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerf.config import SIZES, resolved, size_for
+
+
+def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
+    """The config with nothing left open.
+
+    Raises:
+        InputError: a value out of its range.
+    """
+    side = max(max(image.shape[:2]) for image in views.images)
+    model = config.pipeline.model
+    size = size_for(side) if model.size == "auto" else model.size
+    preset = SIZES[size]
+    manager = config.pipeline.datamanager
+    rays = preset.rays if manager.train_num_rays_per_batch is None else manager.train_num_rays_per_batch
+    iterations = preset.iterations if config.max_num_iterations is None else config.max_num_iterations
+    preview = config.steps_per_eval_image
+    plan = replace(
+        config,
+        experiment_name=config.experiment_name or (config.data.resolve().name if config.data else "unnamed"),
+        max_num_iterations=iterations,
+        steps_per_eval_image=max(1, iterations // 10) if preview is None else preview,
+        pipeline=replace(
+            config.pipeline,
+            datamanager=replace(manager, data=config.data, train_num_rays_per_batch=rays),
+            model=resolved(model, size),
+        ),
+        optimizer=replace(
+            config.optimizer, lr=preset.learning_rate if config.optimizer.lr is None else config.optimizer.lr
+        ),
+    )
+    _check(plan)
+    return plan
+
+
+def _check(plan: TrainerConfig) -> None:
+    model = plan.pipeline.model
+    at_least_one = {
+        "max-num-iterations": plan.max_num_iterations,
+        "steps-per-save": plan.steps_per_save,
+        "steps-per-eval-image": plan.steps_per_eval_image,
+        "steps-per-log": plan.steps_per_log,
+        "pipeline.datamanager.train-num-rays-per-batch": plan.pipeline.datamanager.train_num_rays_per_batch,
+        "pipeline.model.width": model.width,
+        "pipeline.model.depth": model.depth,
+        "pipeline.model.num-importance-samples": model.num_importance_samples,
+    }
+    for flag, value in at_least_one.items():
+        if value is None or value < 1:
+            raise InputError(f"--{flag} is {value}: must be at least 1")
+    if (model.num_coarse_samples or 0) < 3:
+        raise InputError(f"--pipeline.model.num-coarse-samples is {model.num_coarse_samples}: must be at least 3")
+    for flag, frequencies in (("position", model.position_frequencies), ("direction", model.direction_frequencies)):
+        if frequencies is None or not 0 <= frequencies <= 24:
+            raise InputError(f"--pipeline.model.{flag}-frequencies is {frequencies}: must be between 0 and 24")
+    if not 0 <= model.near < model.far < float("inf"):
+        raise InputError(f"--pipeline.model.near {model.near} must be at least 0 and below --pipeline.model.far")
+    if not 0 <= model.density_noise < float("inf"):
+        raise InputError(f"--pipeline.model.density-noise is {model.density_noise}: must be at least 0")
+    if plan.max_seconds is not None and not plan.max_seconds > 0:
+        raise InputError(f"--max-seconds is {plan.max_seconds}: must be above 0")
+    if not 0 < (plan.optimizer.lr or 0) < float("inf"):
+        raise InputError(f"--optimizer.lr is {plan.optimizer.lr}: must be above 0")
+    if not 0 < plan.optimizer.final_fraction <= 1:
+        raise InputError(f"--optimizer.final-fraction is {plan.optimizer.final_fraction}: must be in (0, 1]")
+    if plan.optimizer.eps < 0:
+        raise InputError(f"--optimizer.eps is {plan.optimizer.eps}: must be at least 0")
+    for name in (plan.method_name, plan.experiment_name):
+        if name in (None, "", ".", "..") or "/" in str(name) or "\0" in str(name):
+            raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")

@@ -1,0 +1,156 @@
+"""A run's folder: outputs/<experiment>/<method>/<timestamp>/ with config.json, metrics.jsonl, checkpoints, previews."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+
+from edge_se_sampler.engine.checkpoint import write_atomically
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.methods import registered_methods
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """One run on the disk."""
+
+    path: Path
+
+    @classmethod
+    def create(cls, config: TrainerConfig) -> RunFolder:
+        """A new folder for a planned config; nothing existing is touched.
+
+        Raises:
+            InputError: the output folder cannot be written.
+        """
+        parent = config.output_dir / str(config.experiment_name) / config.method_name
+        stamp = time.strftime("%Y-%m-%d_%H%M%S")
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            for attempt in range(1000):
+                path = parent / (f"{stamp}-{attempt}" if attempt else stamp)
+                try:
+                    path.mkdir()
+                    break
+                except FileExistsError:
+                    continue
+            (path / "checkpoints").mkdir()
+            (path / "previews").mkdir()
+        except OSError as problem:
+            reason = problem.strerror or str(problem)
+            raise InputError(f"--output-dir {config.output_dir}: cannot be written ({reason})") from problem
+        run = cls(path)
+        write_atomically(run.path / "config.json", json.dumps(config_to_json(config), indent=1).encode() + b"\n")
+        return run
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    def config(self) -> TrainerConfig:
+        """The run's settings.
+
+        Raises:
+            InputError: no run folder, or its config.json is broken or of another version.
+        """
+        path = self.path / "config.json"
+        if not self.path.is_dir():
+            raise InputError(f"{self.path}: no such run folder; edge-se train prints where a run lands")
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise InputError(f"{self.path}: not a run folder (no config.json); edge-se train prints it") from None
+        except (OSError, ValueError) as problem:
+            raise InputError(f"{path}: not readable as json ({problem})") from problem
+        name = values.get("method_name") if isinstance(values, dict) else None
+        method = registered_methods().get(str(name))
+        if method is None:
+            raise InputError(f"{path}: method_name is {name!r}, which is not registered here; see edge-se methods")
+        return config_from_json(method.specification.config, values, f"{path}")
+
+    def log(self, line: dict[str, Any]) -> None:
+        """Append a line to metrics.jsonl.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        path = self.path / "metrics.jsonl"
+        try:
+            with open(path, "a", encoding="utf-8") as file:
+                file.write(json.dumps(line, allow_nan=False) + "\n")
+        except OSError as problem:
+            raise InputError(f"{path}: cannot be written ({problem.strerror})") from problem
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl; a last line cut short by a kill is left out."""
+        path = self.path / "metrics.jsonl"
+        if not path.exists():
+            return []
+        lines = path.read_text(encoding="utf-8").split("\n")
+        return [json.loads(line) for line in lines[:-1]]
+
+    def forget_after(self, step: int) -> None:
+        """Drop metrics of later steps: a resumed run writes them again."""
+        kept = [json.dumps(line) + "\n" for line in self.metrics() if line["step"] <= step]
+        write_atomically(self.path / "metrics.jsonl", "".join(kept).encode())
+
+    def preview(self, step: int, image: np.ndarray) -> None:
+        """Save an (H, W, 3) float picture in [0, 1] of a step."""
+        write_image(self.path / "previews" / f"step-{step:09d}.png", image)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Save a picture, (H, W, 3) float in [0, 1].
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    eight_bit = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    write_atomically(path, iio.imwrite("<bytes>", eight_bit, extension=".png"))
+
+
+def config_to_json(config: TrainerConfig) -> dict[str, Any]:
+    """A config as plain values."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=os.fspath))
+
+
+def config_digest(config: TrainerConfig) -> str:
+    """What a checkpoint remembers of its configuration: where the run lies and how long a session lasts aside."""
+    values = config_to_json(config)
+    for free in ("output_dir", "data", "max_seconds", "steps_per_save"):
+        del values[free]
+    del values["pipeline"]["datamanager"]["data"]
+    del values["machine"]["device_type"]
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def config_from_json(default: Any, values: Any, where: str) -> Any:
+    """Plain values back into the (nested) config dataclass that they came from.
+
+    Raises:
+        InputError: fields that are missing or unknown: another version wrote it.
+    """
+    fields = {field.name: field for field in dataclasses.fields(default)}
+    if not isinstance(values, dict) or set(values) != set(fields):
+        differing = sorted(set(values) ^ set(fields)) if isinstance(values, dict) else "not an object"
+        raise InputError(f"{where}: written by another version of edge-se or edited by hand (fields: {differing})")
+    chosen = {}
+    for name, field in fields.items():
+        old, new = getattr(default, name), values[name]
+        if dataclasses.is_dataclass(old):
+            new = config_from_json(old, new, f"{where}: {name}")
+        elif "Path" in str(field.type) and isinstance(new, str):
+            new = Path(new)
+        chosen[name] = new
+    return dataclasses.replace(default, **chosen)

@@ -1,0 +1,103 @@
+"""The commands' work: train, resume, evaluate, from folders and settings to a trained, measured model."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+from pathlib import Path
+
+from edge_se_sampler.data.blender import Views, has_split, read_blender
+from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.evaluation import Picture, pictures_of
+from edge_se_sampler.engine.pipeline import build_model
+from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.trainer import Trainer, choose_device
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerf.model import NeRFModel
+
+
+def prepare(config: TrainerConfig) -> Trainer:
+    """Read the data, decide what the config leaves open, and open a new run folder.
+
+    Raises:
+        InputError: bad data or settings; nothing has been written then.
+    """
+    views, preview = _read(config)
+    device = choose_device(config.machine.device_type)
+    plan = planned(config, views)
+    plan.pipeline.datamanager.pixel_sampler.setup(num_rays_per_batch=1)  # refuses bad settings before a folder is made
+    run = RunFolder.create(plan)
+    return plan.setup(run=run, views=views, preview=preview, device=device)
+
+
+def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
+    """Take up an interrupted run under its own settings; max_seconds holds for this session.
+
+    Raises:
+        InputError: no such run, no or bad checkpoint, or its data is gone.
+    """
+    config = dataclasses.replace(run.config(), max_seconds=max_seconds)
+    latest_checkpoint(run.checkpoints)
+    views, preview = _read(config)
+    device = choose_device(config.machine.device_type)
+    trainer = config.setup(run=run, views=views, preview=preview, device=device)
+    trainer.resume()
+    return trainer
+
+
+def load_model(run: RunFolder) -> tuple[TrainerConfig, NeRFModel, Path]:
+    """A run's settings, its model with the last checkpoint's weights, and that checkpoint.
+
+    Raises:
+        InputError: no such run, or no or bad checkpoint.
+    """
+    config = run.config()
+    checkpoint = latest_checkpoint(run.checkpoints)
+    state = load_checkpoint(checkpoint, config_digest(config))
+    model = build_model(config, choose_device(config.machine.device_type))
+    model.load_state_dict(state["model"])
+    return config, model, checkpoint
+
+
+def test_pictures(config: TrainerConfig) -> list[Picture]:
+    """The held-out views of a run: its test split, or val where there is no test.
+
+    Raises:
+        InputError: neither is there, or one of them is bad.
+    """
+    assert config.data is not None
+    for split in ("test", "val"):
+        if has_split(config.data, split):
+            pictures = pictures_of(read_blender(config.data, split))
+            if pictures:
+                return pictures
+    raise InputError(f"{config.data}: no held-out views; transforms_test.json or transforms_val.json is needed")
+
+
+def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
+    """Training views, and the first validation (or test) view to look at while training."""
+    if config.data is None:
+        raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
+    views = read_blender(config.data, "train")
+    for split in ("val", "test"):
+        if has_split(config.data, split):
+            held_out = read_blender(config.data, split)
+            if held_out.names:
+                return views, pictures_of(held_out)[0]
+    return views, None
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep large freed blocks instead of returning them to the kernel after every operation.
+
+    A CPU training step allocates the same megabytes again and again; faulting their pages in anew costs a third
+    of it. Elsewhere than glibc this does nothing.
+    """
+    m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
+    with contextlib.suppress(OSError, AttributeError):
+        libc = ctypes.CDLL("libc.so.6")
+        for option, value in ((m_mmap_max, 0), (m_trim_threshold, 2**31 - 1), (m_top_pad, 64 * 2**20)):
+            libc.mallopt(option, value)

@@ -1,0 +1,199 @@
+"""The training loop: one run from its data to its last checkpoint."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.evaluation import Picture, render_view
+from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
+from edge_se_sampler.streams import Stream, stream
+
+POINTS_PER_CHUNK = 16_384
+"""Network evaluations that are differentiated at once: the activations of more fall out of the CPU's caches."""
+
+
+class Trainer:
+    """Trains a model into a run folder.
+
+    Args:
+        config: planned (see `plan`).
+        run: where it is written.
+        views: training views.
+        preview: a view to look at while training, or None.
+        device: "cpu" or "cuda".
+    """
+
+    def __init__(
+        self, config: TrainerConfig, *, run: RunFolder, views: Views, preview: Picture | None, device: str
+    ) -> None:
+        self.config, self.run, self.preview_picture = config, run, preview
+        self.planned_steps = config.max_num_iterations or 0
+        self.pipeline = Pipeline.build(config, views, device)
+        self.optimizer = torch.optim.Adam(self.pipeline.model.parameters(), lr=1.0, eps=config.optimizer.eps)
+        self.next_step = 0
+        self.elapsed = 0.0
+        self.stop_requested = False
+        self.callbacks = self.pipeline.datamanager.get_training_callbacks(
+            TrainingCallbackAttributes(pipeline=self.pipeline, trainer=self)
+        )
+        self._preview_psnr: float | None = None
+
+    def resume(self) -> None:
+        """Take up the run at its last checkpoint.
+
+        Raises:
+            InputError: no checkpoint, or a bad one.
+        """
+        state = load_checkpoint(latest_checkpoint(self.run.checkpoints), config_digest(self.config))
+        self.pipeline.model.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
+        self.run.forget_after(state["step"])
+
+    def train(self) -> None:
+        """Train to the end of the plan, to max_seconds, or until Ctrl-C; then save.
+
+        Raises:
+            FloatingPointError: the loss is not finite; the last checkpoint stands.
+            InputError: something cannot be written.
+        """
+        config = self.config
+        progress = Progress(self.planned_steps, config.method_name, self.next_step)
+        began = time.monotonic() - self.elapsed
+        deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds
+        with self._interruptible():
+            while self.next_step < self.planned_steps:
+                step = self.next_step
+                loss = self.train_iteration(step)
+                self.next_step, self.elapsed = step + 1, time.monotonic() - began
+                ended = self.next_step == self.planned_steps
+                stop = ended or self.stop_requested or time.monotonic() >= deadline
+                if ended or step % config.steps_per_log == 0:
+                    self._log(step, loss)
+                if ended or self.next_step % (config.steps_per_eval_image or 1) == 0:
+                    self._preview(step)
+                    began = time.monotonic() - self.elapsed  # looking is not training
+                if stop or self.next_step % config.steps_per_save == 0:
+                    self.save()
+                progress.update(self.next_step, self._note(loss))
+                if stop:
+                    break
+        progress.close()
+
+    def train_iteration(self, step: int) -> float:
+        """One step; returns its loss."""
+        model = self.pipeline.model
+        model.train()
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        model.reseed(int(stream(self.config.machine.seed, step, Stream.MODEL).integers(2**63)))
+        rays, batch = self.pipeline.datamanager.next_train(step)
+        self.optimizer.zero_grad(set_to_none=False)
+        loss = torch.zeros((), device=model.device)
+        for rows in self._chunks(len(rays)):
+            part = model.loss(model(rays[rows]), {key: value[rows] for key, value in batch.items()})
+            part = part.sum() / len(rays)
+            part.backward()
+            loss += part.detach()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate(step)
+        value = float(loss)
+        if not math.isfinite(value):
+            raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
+        self.optimizer.step()
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        return value
+
+    def learning_rate(self, step: int) -> float:
+        """lr * final_fraction^(step / planned steps)."""
+        optimizer = self.config.optimizer
+        return (optimizer.lr or 0.0) * optimizer.final_fraction ** (step / self.planned_steps)
+
+    def save(self) -> None:
+        """Write a checkpoint of the steps done so far."""
+        state = {
+            "step": self.next_step - 1,
+            "elapsed": self.elapsed,
+            "config_digest": config_digest(self.config),
+            "model": self.pipeline.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
+        save_checkpoint(self.run.checkpoints, self.next_step - 1, state)
+
+    def _chunks(self, rays: int) -> Iterator[slice]:
+        model = self.config.pipeline.model
+        points = 2 * (model.num_coarse_samples or 0) + (model.num_importance_samples or 0)
+        size = max(1, POINTS_PER_CHUNK // points) if self.pipeline.model.device.type == "cpu" else rays
+        return (slice(start, start + size) for start in range(0, rays, size))
+
+    def _log(self, step: int, loss: float) -> None:
+        strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
+        self.run.log(
+            {
+                "step": step,
+                "loss": loss,
+                "learning_rate": self.learning_rate(step),
+                "strategy": strategy,
+                "seconds": round(self.elapsed, 3),
+            }
+        )
+
+    def _preview(self, step: int) -> None:
+        if self.preview_picture is None:
+            return
+        rendered, psnr = render_view(self.pipeline.model, self.preview_picture)
+        self._preview_psnr = psnr
+        self.run.log({"step": step, "val_psnr": psnr, "seconds": round(self.elapsed, 3)})
+        self.run.preview(step, rendered)
+
+    def _note(self, loss: float) -> str:
+        rate = self.next_step * (self.config.pipeline.datamanager.train_num_rays_per_batch or 0) / self.elapsed
+        psnr = "" if self._preview_psnr is None else f"  PSNR {self._preview_psnr:.2f}"
+        return f"{rate:,.0f} rays/s  loss {loss:.5f}{psnr}"
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """Ctrl-C or a termination lets the step end, so that what is saved is whole."""
+
+        def request_stop(*_: Any) -> None:
+            self.stop_requested = True
+
+        signals = (signal.SIGINT, signal.SIGTERM)
+        try:
+            previous = [(number, signal.signal(number, request_stop)) for number in signals]
+        except ValueError:  # not the main thread: signals are somebody else's
+            previous = []
+        try:
+            yield
+        finally:
+            for number, handler in previous:
+                signal.signal(number, handler)
+
+
+def choose_device(device_type: str) -> str:
+    """The torch device for --machine.device-type.
+
+    Raises:
+        InputError: cuda is asked for and not there.
+    """
+    if device_type == "cuda" and not torch.cuda.is_available():
+        raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
+    if device_type == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return device_type
+

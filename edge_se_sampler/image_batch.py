@@ -1,0 +1,79 @@
+"""A host's batch of images, stacked or in lists, seen one way.
+
+k      images in the batch; they carry absolute numbers and may differ in size
+drawn  (n, 3) int64: position in the batch, row, column
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ImageBatch:
+    """A batch of k images and whatever else it holds for each pixel."""
+
+    numbers: Tensor
+    """(k,) int64: absolute image numbers."""
+    sizes: list[tuple[int, int]]
+    """Rows and columns of each image."""
+    per_pixel: dict[str, Any]
+    """Key -> k tensors (H, W, ...), stacked or in a list; "image" among them."""
+    mask: Any
+    """k tensors (H, W, 1), non-zero where a pixel may be drawn; None: everywhere."""
+
+    @classmethod
+    def of(cls, image_batch: dict[str, Any], *, use_mask: bool) -> ImageBatch:
+        """Read a host's batch.
+
+        Raises:
+            ValueError: a key that is neither stacked (k, H, W, ...) nor a list of k (H, W, ...).
+        """
+        per_pixel = {key: value for key, value in image_batch.items() if key != "image_idx" and value is not None}
+        sizes = _sizes(image_batch["image"])
+        for key, value in per_pixel.items():
+            if _sizes(value) != sizes:
+                raise ValueError(f"image batch: {key!r} has not one (H, W, ...) tensor for each image")
+        return cls(image_batch["image_idx"], sizes, per_pixel, per_pixel.get("mask") if use_mask else None)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the images are."""
+        return self.per_pixel["image"][0].device
+
+    def image(self, k: int) -> np.ndarray:
+        """Image at position k, (H, W, 3|4), as it is stored."""
+        return self.per_pixel["image"][k].cpu().numpy()
+
+    def valid(self, k: int) -> Tensor:
+        """(H, W) bool on the CPU: the pixels at position k that may be drawn."""
+        return self.mask[k].reshape(self.sizes[k]).bool().cpu()
+
+    def gather(self, drawn: Tensor) -> dict[str, Any]:
+        """Every per-pixel key at the drawn pixels, and `indices` with absolute image numbers."""
+        pixels = {key: self._pick(value, drawn.to(value[0].device)) for key, value in self.per_pixel.items()}
+        numbers = self.numbers.to(drawn.device)[drawn[:, :1]]
+        pixels["indices"] = torch.cat((numbers, drawn[:, 1:]), dim=1).to(self.device)
+        return pixels
+
+    @staticmethod
+    def _pick(value: Any, drawn: Tensor) -> Tensor:
+        position, row, column = drawn.unbind(1)
+        if isinstance(value, Tensor):
+            return value[position, row, column]
+        picked = value[0].new_empty((len(drawn), *value[0].shape[2:]))
+        for k in torch.unique(position).tolist():  # ragged: image by image
+            here = position == k
+            picked[here] = value[k][row[here], column[here]]
+        return picked
+
+
+def _sizes(images: Any) -> list[tuple[int, int]]:
+    if isinstance(images, Tensor):
+        return [(int(images.shape[1]), int(images.shape[2]))] * len(images)
+    return [(int(image.shape[0]), int(image.shape[1])) for image in images]

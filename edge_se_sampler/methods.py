@@ -1,0 +1,66 @@
+"""The named methods: the paper's six strategies, and whatever other packages register. Torch-free.
+
+A package adds a method with an entry point of the group edge_se_sampler.method_configs that names a
+`protocol.MethodSpecification`.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+
+from edge_se_sampler.data.config import VanillaDataManagerConfig
+from edge_se_sampler.engine.config import PipelineConfig, TrainerConfig
+from edge_se_sampler.protocol import MethodSpecification
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+
+ENTRY_POINT_GROUP = "edge_se_sampler.method_configs"
+
+STRATEGIES = {
+    "vanilla-nerf": ("uniform", "uniform", "Random: NeRF with pixels drawn uniformly"),
+    "precrop-nerf": ("precrop", "uniform", "Precrop + Random: the centre of the image first"),
+    "se-nerf": ("uniform", "se", "SE: uniform first, then by the rank of the squared error"),
+    "precrop-se-nerf": ("precrop", "se", "Precrop + SE: the centre first, then by squared error"),
+    "edge-nerf": ("edge", "uniform", "Edge: by edge strength first, then uniformly"),
+    "edge-se-nerf": ("edge", "se", "Edge + SE: by edge strength first, then by squared error"),
+}
+"""Name -> early, late, description: table 1 of the paper."""
+
+
+def _strategy(name: str) -> MethodSpecification:
+    early, late, description = STRATEGIES[name]
+    sampler = EdgeSEPixelSamplerConfig(early=early, late=late)  # pyright: ignore[reportArgumentType]
+    pipeline = PipelineConfig(datamanager=VanillaDataManagerConfig(pixel_sampler=sampler))
+    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description)
+
+
+@dataclass(frozen=True)
+class RegisteredMethod:
+    """A method and the distribution it comes from."""
+
+    specification: MethodSpecification
+    origin: str
+
+
+def registered_methods() -> dict[str, RegisteredMethod]:
+    """Every method by name: ours, then those of other installed packages.
+
+    An entry point that fails to load, is no MethodSpecification or takes a name that exists is left out with
+    one line on stderr; it must not keep the others from working.
+    """
+    methods = {name: RegisteredMethod(_strategy(name), "edge_se_sampler") for name in STRATEGIES}
+    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
+        origin = entry.dist.name if entry.dist else entry.value
+        try:
+            specification = entry.load()
+            if not isinstance(specification, MethodSpecification):
+                raise TypeError(f"{entry.value} is not a MethodSpecification")
+            name = specification.config.method_name
+            if name in methods:
+                raise ValueError(f"the name {name!r} is taken by {methods[name].origin}")
+        except Exception as problem:  # whatever another package's import may raise
+            print(f"edge-se: method {entry.name!r} of {origin} left out: {problem}", file=sys.stderr)
+            continue
+        methods[name] = RegisteredMethod(specification, origin)
+    return methods

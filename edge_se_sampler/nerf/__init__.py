@@ -1,0 +1,1 @@
+"""The vanilla NeRF (Mildenhall et al. 2020)."""

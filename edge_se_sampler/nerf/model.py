@@ -1,0 +1,130 @@
+"""The NeRF model: rays -> colours, by a coarse and a fine network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.nerf.config import NeRFModelConfig
+from edge_se_sampler.nerf.field import NeRFField
+from edge_se_sampler.nerf.samples import importance, stratified
+from edge_se_sampler.nerf.volume import composite, intervals, sample_weights
+
+
+class NeRFModel(nn.Module):
+    """Coarse and fine networks, stratified and importance samples.
+
+    Args:
+        config: resolved, without None.
+        rng: of the initial weights.
+    """
+
+    def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
+        super().__init__()
+        self.config = config
+        self.coarse = NeRFField(config, rng)
+        self.fine = NeRFField(config, rng)
+        self.random = torch.Generator()
+        """Of jitter, noise and random backgrounds; the trainer seeds it at every step."""
+        self.occupied: Callable[[Tensor], Tensor] | None = None
+        """Positions (m, 3) -> (m,) bool; where False, the density is 0 and no network is asked. None: everywhere."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.coarse.density.weight.device
+
+    def reseed(self, seed: int) -> None:
+        """Make the randomness of what follows a function of the seed."""
+        if self.random.device != self.device:
+            self.random = torch.Generator(self.device)
+        self.random.manual_seed(seed)
+
+    def forward(self, rays: RayBundle) -> dict[str, Tensor]:
+        """Render rays; in training mode with jittered samples.
+
+        Returns:
+            rgb_coarse, rgb_fine (n, 3); accumulation_coarse, accumulation_fine (n, 1); depth_fine (n, 1) in
+            world units along the ray; background (n, 3) behind each ray.
+        """
+        config, count = self.config, len(rays)
+        samples = config.num_coarse_samples or 0
+        norm = rays.metadata["directions_norm"]
+        jitter = self._uniform(count, samples) if self.training else None
+        t = stratified(config.near * norm, config.far * norm, samples, jitter)
+        background = self._background(count)
+        weights, rgb = self._render(self.coarse, rays, t, background)
+        outputs = {"rgb_coarse": rgb, "accumulation_coarse": weights.sum(1, keepdim=True), "background": background}
+
+        t = torch.sort(torch.cat((t, self._importance(t, weights.detach())), dim=1)).values
+        weights, rgb = self._render(self.fine, rays, t, background)
+        accumulation = weights.sum(1, keepdim=True)
+        depth = (weights * t).sum(1, keepdim=True) + (1 - accumulation) * t[:, -1:]
+        return outputs | {"rgb_fine": rgb, "accumulation_fine": accumulation, "depth_fine": depth}
+
+    def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
+        """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.
+
+        Args:
+            image: (n, 3|4) straight-alpha pixels in [0, 1].
+        """
+        return (outputs[f"rgb_{level}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
+
+    def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+        """(n,) what training minimises the mean of: coarse + fine error, a mean over channels as in NeRF's code."""
+        image = batch["image"]
+        error = self.squared_error(outputs, image, "coarse") + self.squared_error(outputs, image, "fine")
+        return error * batch["weight"] / 3 if "weight" in batch else error / 3
+
+    def _importance(self, t: Tensor, weights: Tensor) -> Tensor:
+        count = self.config.num_importance_samples or 0
+        if self.training:
+            uniform = self._uniform(len(t), count)
+        else:
+            uniform = torch.linspace(0, 1, count, dtype=t.dtype, device=t.device).expand(len(t), count)
+        return importance((t[:, 1:] + t[:, :-1]) / 2, weights[:, 1:-1], uniform)
+
+    def _render(self, field: NeRFField, rays: RayBundle, t: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (n, s) and colours (n, 3) of rays sampled at t (n, s)."""
+        positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
+        noise = self._noise(t.numel())
+        if self.occupied is None:
+            density, color = field(positions, rays.directions, None, noise)
+        else:
+            packed = torch.nonzero(self.occupied(positions))[:, 0]
+            ray = torch.div(packed, t.shape[1], rounding_mode="floor")
+            noise = None if noise is None else noise[packed]
+            some_density, some_color = field(positions[packed], rays.directions, ray, noise)
+            density = t.new_zeros(t.numel()).index_put((packed,), some_density)
+            color = t.new_zeros((t.numel(), 3)).index_put((packed,), some_color)
+        weights = sample_weights(density.reshape(t.shape), intervals(t))
+        return weights, composite(weights, color.reshape(*t.shape, 3), background)
+
+    def _noise(self, count: int) -> Tensor | None:
+        """(count,) noise on the raw density, in training only."""
+        if not (self.training and self.config.density_noise):
+            return None
+        dtype = self.coarse.density.weight.dtype
+        standard = torch.randn(count, generator=self.random, device=self.device, dtype=dtype)
+        return standard * self.config.density_noise
+
+    def _uniform(self, rows: int, columns: int) -> Tensor:
+        dtype = self.coarse.density.weight.dtype
+        return torch.rand((rows, columns), generator=self.random, device=self.device, dtype=dtype)
+
+    def _background(self, count: int) -> Tensor:
+        if self.training and self.config.background_color == "random":
+            return self._uniform(count, 3)
+        shade = 0.0 if self.config.background_color == "black" else 1.0
+        return torch.full((count, 3), shade, device=self.device, dtype=self.coarse.density.weight.dtype)
+
+
+def target_colors(image: Tensor, background: Tensor) -> Tensor:
+    """What a ray should show: (n, 3|4) straight-alpha pixels composited on (n, 3) backgrounds."""
+    if image.shape[1] == 3:
+        return image
+    return image[:, :3] * image[:, 3:] + background * (1 - image[:, 3:])

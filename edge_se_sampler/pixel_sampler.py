@@ -1,0 +1,193 @@
+"""The sampling class: edges, distributions, ranking and schedule under any host's PixelSampler.
+
+`ImportantPixels` is a mixin: put before a host's PixelSampler it decides which pixels are drawn and gathers them;
+the base contributes only its config and batch size. It is the same code under our protocol's base and under
+nerfstudio's, and draws the same pixels there.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edge_se_sampler.distribution import PixelTable, UniformPixels
+from edge_se_sampler.edges import WHITE, edge_strength
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.image_batch import ImageBatch
+from edge_se_sampler.protocol import PixelSampler
+from edge_se_sampler.ranking import keep_by_rank
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.schedule import phase_at
+from edge_se_sampler.streams import Stream, stream
+
+SquaredError = Callable[[dict[str, Any]], Tensor]
+"""Candidate batch -> (m,) squared errors of the model's current (fine) colours, without gradients."""
+
+
+@dataclass
+class _Tables:
+    """The finished tables of one way of drawing, keyed by absolute image number."""
+
+    table: PixelTable
+    place: dict[int, int]
+
+
+class ImportantPixels:
+    """Mixin over a host's PixelSampler: Random, Precrop, Edge, then Random or squared error.
+
+    Unbound (in evaluation, viewers, exporters) it draws uniformly. `bind` and `set_step` make it follow training;
+    the data manager calls them. Masked pixels are never drawn.
+    """
+
+    config: Any  # SamplingSettings and the host's PixelSamplerConfig in one
+    num_rays_per_batch: int
+
+    def __init__(self, config: Any, **kwargs: Any) -> None:
+        # hosts share one config between training and evaluation, and write into it
+        super().__init__(copy.copy(config), **kwargs)
+        self.config.check()
+        self.background: tuple[float, float, float] = kwargs.get("background_color") or WHITE
+        self._squared_error: SquaredError | None = None
+        self._early_steps = 0.0
+        self._seed = 0
+        self._step = 0
+        self._tables: dict[str, _Tables] = {}
+
+    def bind(self, *, squared_error: SquaredError, planned_steps: int, seed: int) -> None:
+        """Follow a training run.
+
+        Args:
+            squared_error: scores candidates, see `SquaredError`.
+            planned_steps: length of the run as first planned; resuming does not change it.
+            seed: of the draws.
+        """
+        self._squared_error = squared_error
+        self._early_steps = self.config.early_length(planned_steps)
+        self._seed = seed
+
+    def set_step(self, step: int) -> None:
+        """The step about to be trained; the phase and the draws depend on it alone."""
+        self._step = step
+
+    @property
+    def strategy(self) -> str:
+        """How the current step draws: "uniform", "precrop", "edge" or "se"."""
+        if self._squared_error is None:
+            return "uniform"
+        return self.config.early if phase_at(self._step, self._early_steps) == "early" else self.config.late
+
+    def strength(self, strategy: str, image: np.ndarray) -> np.ndarray:
+        """Strength of every pixel under a strategy that weighs them; a seventh way overrides this.
+
+        Args:
+            image: (H, W, 3|4), uint8 or float in [0, 1].
+
+        Returns:
+            (H, W) float32, >= 0.
+        """
+        if strategy == "edge":
+            edges = edge_strength(
+                image,
+                edge_filter=self.config.edge_filter,
+                source=self.config.edge_source,
+                background=self.background,
+            )
+            return edges + np.float32(self.config.edge_epsilon)
+        size = image.shape[:2]
+        inside = np.zeros(size, dtype=np.float32)
+        box = UniformPixels([size], self._box_side(strategy))
+        (top, left), (height, width) = box.low[0].int().tolist(), box.extent[0].int().tolist()
+        inside[top : top + height, left : left + width] = 1
+        return inside
+
+    def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
+        """Choose the step's pixels; see the protocol's PixelSampler.sample.
+
+        The batch also has `weight` (N,) when importance weights are asked for.
+
+        Raises:
+            InputError: every pixel of every image is masked, or alpha edges of images without alpha.
+            FloatingPointError: a candidate's squared error is not finite.
+        """
+        batch = ImageBatch.of(image_batch, use_mask=not self.config.ignore_mask)
+        strategy, count = self.strategy, self.num_rays_per_batch
+        if self._squared_error is None:
+            self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
+        if strategy == "se":
+            self._tables.pop("edge", None)  # the early phase is over: give its memory back
+            pixels = self._candidates(batch, count)
+        else:
+            pixels, weight = self._draw(batch, strategy, count)
+            pixels = batch.gather(pixels)
+            if weight is not None:
+                pixels["weight"] = weight
+        if self.config.keep_full_image:
+            pixels["full_image"] = image_batch["image"]
+        return pixels
+
+    def distribution(self, batch: ImageBatch, strategy: str) -> tuple[UniformPixels | PixelTable, Tensor]:
+        """What a strategy draws from, and the place of each image of the batch in it, (k,) int64."""
+        if strategy in ("uniform", "precrop") and batch.mask is None:
+            return UniformPixels(batch.sizes, self._box_side(strategy)), torch.arange(len(batch.sizes))
+        tables = self._tables.setdefault(strategy, _Tables(PixelTable(), {}))
+        numbers = batch.numbers.tolist()
+        new = [k for k, number in enumerate(numbers) if number not in tables.place]
+        if new:
+            with ThreadPoolExecutor() as threads:
+                tables.table.add(threads.map(lambda k: self._valid_strength(batch, strategy, k), new))
+            tables.place.update({numbers[k]: len(tables.place) + i for i, k in enumerate(new)})
+        return tables.table, torch.tensor([tables.place[number] for number in numbers])
+
+    def _box_side(self, strategy: str) -> float:
+        return self.config.precrop_fraction if strategy == "precrop" else 1.0
+
+    def _valid_strength(self, batch: ImageBatch, strategy: str, k: int) -> Tensor:
+        try:
+            strength = torch.from_numpy(self.strength(strategy, batch.image(k)))
+        except ValueError as problem:
+            raise InputError(f"image {int(batch.numbers[k])}: {problem}") from problem
+        return strength if batch.mask is None else strength * batch.valid(k)
+
+    def _draw(self, batch: ImageBatch, strategy: str, count: int) -> tuple[Tensor, Tensor | None]:
+        """Pixels (count, 3): position in the batch, row, column; and their loss weights, if any are asked for."""
+        rng = stream(self._seed, self._step, Stream.PIXELS)
+        source, places = self.distribution(batch, strategy)
+        drawable = torch.nonzero(source.drawable(places))[:, 0]
+        if not len(drawable):
+            raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
+        if self.config.images_per_step == "one":
+            drawable = drawable[rng.integers(len(drawable), size=1)]
+        drawn = source.draw(places[drawable], count, rng)
+        weight = None
+        if self.config.importance_weight:
+            relative = source.relative(places[drawable], drawn)
+            weight = (relative**-self.config.importance_weight).float().to(batch.device)
+        drawn[:, 0] = drawable[drawn[:, 0]]
+        return drawn, weight
+
+    def _candidates(self, batch: ImageBatch, count: int) -> dict[str, Any]:
+        """Score uniform candidates and keep `count` of them by rank."""
+        assert self._squared_error is not None
+        drawn, _ = self._draw(batch, "uniform", self.config.se_candidates * count)
+        candidates = batch.gather(drawn)
+        with torch.no_grad():
+            errors = self._squared_error(candidates)
+        kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION))
+        pixels = {key: value[kept.index.to(value.device)] for key, value in candidates.items()}
+        if self.config.importance_weight:
+            share = count / len(drawn)  # what every candidate's inclusion would be without ranks
+            pixels["weight"] = (kept.inclusion / share).to(batch.device) ** -self.config.importance_weight
+        return pixels
+
+
+class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
+    """Important-pixel sampling on our own protocol's base."""
+
+    config: EdgeSEPixelSamplerConfig

@@ -1,0 +1,117 @@
+"""The minimal nerfstudio-compatible protocol: the same names, arguments and meanings, only as much as is used.
+
+A class written against nerfstudio 1.1.5's PixelSampler or VanillaDataManager contract finds here what it asks of
+its host: `config.setup(**kwargs)`, `sample(image_batch)` returning `indices` with absolute image numbers, data
+managers with `next_train(step)` and training callbacks bound to a pipeline. Torch-free at import.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, auto
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar
+
+if TYPE_CHECKING:
+    from edge_se_sampler.engine.config import TrainerConfig
+    from edge_se_sampler.engine.pipeline import Pipeline
+    from edge_se_sampler.engine.trainer import Trainer
+
+
+class InstantiateConfig:
+    """A config that can build what it configures."""
+
+    _target: ClassVar[type | str]
+    """The class to build, or "module:Class", imported on `setup` only: reading configs stays cheap."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The configured object: target(config, **kwargs)."""
+        target = self._target
+        if isinstance(target, str):
+            module, name = target.split(":")
+            target = getattr(import_module(module), name)
+        return target(self, **kwargs)
+
+
+@dataclass
+class PixelSamplerConfig(InstantiateConfig):
+    """What any pixel sampler has to know. Not frozen: nerfstudio's is not, and theirs may stand in for ours."""
+
+    num_rays_per_batch: int = 1024
+    """Pixels drawn a step; the data manager's number of rays overrides it."""
+    keep_full_image: bool = False
+    """Return the whole images as well, under "full_image"."""
+    ignore_mask: bool = False
+    """Draw from masked pixels too."""
+
+
+class PixelSampler(ABC):
+    """Chooses the pixels of a training step.
+
+    Args:
+        config: its settings; kwargs named num_rays_per_batch, keep_full_image override them, others are kept.
+    """
+
+    config: PixelSamplerConfig
+
+    def __init__(self, config: PixelSamplerConfig, **kwargs: Any) -> None:
+        self.config = config
+        self.kwargs = kwargs
+        self.config.keep_full_image = kwargs.get("keep_full_image", config.keep_full_image)
+        self.set_num_rays_per_batch(kwargs.get("num_rays_per_batch", config.num_rays_per_batch))
+
+    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
+        """Change how many pixels a step draws."""
+        self.num_rays_per_batch = num_rays_per_batch
+
+    @abstractmethod
+    def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
+        """Choose pixels.
+
+        Args:
+            image_batch: `image_idx` (k,) int64 absolute numbers; `image` (k, H, W, 3|4) float in [0, 1] or uint8;
+                optionally `mask` (k, H, W, 1) bool and other per-pixel tensors. Lists of k tensors when sizes
+                differ.
+
+        Returns:
+            every per-pixel key gathered at the N chosen pixels, and `indices` (N, 3) int64: absolute image
+            number, row, column.
+        """
+
+
+class TrainingCallbackLocation(Enum):
+    """When a callback runs."""
+
+    BEFORE_TRAIN_ITERATION = auto()
+    AFTER_TRAIN_ITERATION = auto()
+
+
+@dataclass(frozen=True)
+class TrainingCallbackAttributes:
+    """What a callback may reach."""
+
+    pipeline: Pipeline
+    trainer: Trainer
+
+
+@dataclass(frozen=True)
+class TrainingCallback:
+    """A function of the step that training calls. func(step=...)."""
+
+    where_to_run: list[TrainingCallbackLocation]
+    func: Callable[..., None]
+
+    def run_callback_at_location(self, step: int, location: TrainingCallbackLocation) -> None:
+        """Run it if this is one of its places."""
+        if location in self.where_to_run:
+            self.func(step=step)
+
+
+@dataclass(frozen=True)
+class MethodSpecification:
+    """A named method, as an entry point of the group edge_se_sampler.method_configs offers it."""
+
+    config: TrainerConfig
+    description: str

@@ -1,0 +1,80 @@
+"""The settings of important-pixel sampling, the same flags in every host.
+
+Not frozen, because nerfstudio's configs are not and a subclass of theirs cannot be; samplers copy it.
+Torch-free, so that `--help` need not wait for torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.protocol import PixelSamplerConfig
+
+
+@dataclass
+class SamplingSettings:
+    """Which pixels train the network, early and late. Early and late together cover the paper's six strategies."""
+
+    early: Literal["uniform", "precrop", "edge"] = "edge"
+    """How pixels are drawn in the early phase: all alike, from the centred box, or in proportion to edge strength."""
+    late: Literal["uniform", "se"] = "se"
+    """How pixels are drawn afterwards: all alike, or by the rank of their squared error among uniform candidates."""
+    schedule: Literal["fraction", "steps"] = "fraction"
+    """What ends the early phase: a share of the planned iterations, or a number of steps."""
+    early_fraction: float = 0.1
+    """Share of the planned iterations that the early phase lasts (schedule: fraction); the paper's 1/10."""
+    early_steps: int = 0
+    """Number of steps that the early phase lasts (schedule: steps)."""
+    images_per_step: Literal["one", "all"] = "one"
+    """Draw a step's pixels from one image (the paper) or from all images at hand (nerfstudio); an image is chosen
+    first, a pixel in it second."""
+    precrop_fraction: float = 0.5
+    """Side of the precrop box as a share of the image's side."""
+    edge_filter: Literal["sobel", "laplacian", "canny"] = "sobel"
+    """Edge operator; a full-contrast step answers 1 under each."""
+    edge_source: Literal["color", "alpha", "both"] = "color"
+    """Edges of the colour composited on the background, of alpha (a white object on white has no colour edge), or
+    the stronger of both."""
+    edge_epsilon: float = 0.01
+    """Strength that every pixel has besides its edge (epsilon of equation 5), so that none has probability 0."""
+    se_candidates: int = 2
+    """Candidates scored for each pixel that squared-error sampling keeps."""
+    importance_weight: float = 0.0
+    """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
+    power of them."""
+
+    def check(self) -> None:
+        """Raise InputError for a value or a combination that has no meaning."""
+
+        def refuse(field: str, problem: str) -> None:
+            raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
+
+        if not 0 < self.precrop_fraction <= 1:
+            refuse("precrop_fraction", "must be above 0 and at most 1")
+        if not 0 <= self.early_fraction <= 1:
+            refuse("early_fraction", "must be between 0 and 1")
+        if self.schedule == "steps" and self.early_steps < 1:
+            refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
+        if self.schedule == "fraction" and self.early_steps:
+            refuse("early_steps", "has no effect under schedule 'fraction'; add --...schedule steps")
+        if not 0 < self.edge_epsilon < float("inf"):
+            refuse("edge_epsilon", "must be above 0 (0 would never train flat regions)")
+        if self.se_candidates < 2:
+            refuse("se_candidates", "must be at least 2, or there is nothing to choose from")
+        if not 0 <= self.importance_weight <= 1:
+            refuse("importance_weight", "must be between 0 and 1")
+        if self.importance_weight and (self.early, self.late) == ("uniform", "uniform"):
+            refuse("importance_weight", "has no effect when every pixel is drawn alike")
+
+    def early_length(self, planned_steps: int) -> float:
+        """Steps that the early phase lasts in a run planned for that many."""
+        return self.early_steps if self.schedule == "steps" else self.early_fraction * planned_steps
+
+
+@dataclass
+class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
+    """Important-pixel sampling under our own protocol."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.pixel_sampler:EdgeSEPixelSampler"

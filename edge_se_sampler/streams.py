@@ -1,0 +1,37 @@
+"""Random numbers that need no state: every draw is a function of (seed, step, stream).
+
+Philox is counter-based (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the seed and the
+stream are its key, the step sits in the second word of its counter. Streams therefore never overlap (each step
+owns 2^64 blocks), a resumed run needs no saved generator, and the global generators are neither read nor moved.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """What a random number is for; the value is part of the key and must never change."""
+
+    PIXELS = 1
+    """Which pixels a step draws."""
+    SELECTION = 2
+    """Which candidates squared-error sampling keeps."""
+    MODEL = 3
+    """Jitter along the rays, density noise, random backgrounds."""
+    WEIGHTS = 4
+    """Initial weights of the networks."""
+
+
+def stream(seed: int, step: int, purpose: Stream) -> np.random.Generator:
+    """The generator of one purpose in one training step.
+
+    Args:
+        seed: any integer; taken modulo 2^64.
+        step: >= 0.
+    """
+    key = np.array([seed % 2**64, int(purpose)], dtype=np.uint64)
+    counter = np.array([0, step, 0, 0], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=counter))

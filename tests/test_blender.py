@@ -1,0 +1,203 @@
+"""Blender folders as they should be: what read_blender makes of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from blender_folder import ANGLE, HEIGHT, WIDTH, chunk, pixels, png, pose, write_json, write_scene
+
+from edge_se_sampler.data.blender import has_split, read_blender
+
+
+@pytest.fixture
+def doc(tmp_path: Path) -> dict[str, Any]:
+    return write_scene(tmp_path)
+
+
+def test_pixels_names_and_poses_are_those_on_disk(tmp_path: Path, doc: dict[str, Any]) -> None:
+    views = read_blender(tmp_path, "train")
+    assert views.names == ("./train/r_0", "./train/r_1", "./train/r_2")
+    assert views.masks is None
+    for i, image in enumerate(views.images):
+        assert image.dtype == np.uint8
+        np.testing.assert_array_equal(image, pixels(i))  # alpha straight: colours under alpha 0 too
+    assert views.camera_to_worlds.dtype == np.float64
+    expected = [frame["transform_matrix"][:3] for frame in doc["frames"]]
+    np.testing.assert_array_equal(views.camera_to_worlds, expected)  # every bit of the doubles
+
+
+def test_camera_from_the_angle(tmp_path: Path, doc: dict[str, Any]) -> None:
+    views = read_blender(tmp_path, "train")
+    assert views.focal.shape == views.principal.shape == (3, 2)
+    assert views.focal.dtype == views.principal.dtype == np.float64
+    np.testing.assert_allclose(views.focal, 0.5 * WIDTH / math.tan(0.5 * ANGLE), rtol=1e-15)
+    np.testing.assert_array_equal(views.principal, [[WIDTH / 2, HEIGHT / 2]] * 3)
+
+
+def test_the_known_focal_of_nerf_synthetic(tmp_path: Path, doc: dict[str, Any]) -> None:
+    for i in range(3):
+        iio.imwrite(tmp_path / f"train/r_{i}.png", np.zeros((2, 800, 3), np.uint8))
+    np.testing.assert_allclose(read_blender(tmp_path, "train").focal, 1111.1110311937682, rtol=1e-12)
+
+
+def test_lengths_in_pixels_override_the_angle_and_a_frame_its_file(tmp_path: Path, doc: dict[str, Any]) -> None:
+    doc |= {"fl_x": 10, "fl_y": 11.5, "cx": 2.5, "cy": -1}
+    doc["frames"][1] |= {"fl_x": 20.25, "cy": 1.75}
+    write_json(tmp_path, doc)
+    views = read_blender(tmp_path, "train")
+    np.testing.assert_array_equal(views.focal, [[10, 11.5], [20.25, 11.5], [10, 11.5]])
+    np.testing.assert_array_equal(views.principal, [[2.5, -1], [2.5, 1.75], [2.5, -1]])
+
+
+def test_the_angle_may_be_missing_beside_fl_x_and_pixels_are_square(tmp_path: Path, doc: dict[str, Any]) -> None:
+    del doc["camera_angle_x"]
+    for i, frame in enumerate(doc["frames"]):
+        frame["fl_x"] = i + 1
+    write_json(tmp_path, doc)
+    np.testing.assert_array_equal(read_blender(tmp_path, "train").focal, [[1, 1], [2, 2], [3, 3]])
+
+
+def test_sizes_may_differ_where_frames_state_them(tmp_path: Path, doc: dict[str, Any]) -> None:
+    iio.imwrite(tmp_path / "train/r_1.png", pixels(7, 3, 5, 3))
+    doc |= {"w": WIDTH, "h": float(HEIGHT)}  # instant-ngp's tools write 4.0
+    doc["frames"][1] |= {"w": 3, "h": 5}
+    write_json(tmp_path, doc)
+    views = read_blender(tmp_path, "train")
+    np.testing.assert_array_equal(views.images[1], pixels(7, 3, 5, 3))
+    np.testing.assert_allclose(views.focal[:, 0] / [WIDTH, 3, WIDTH], 0.5 / math.tan(0.5 * ANGLE))
+    np.testing.assert_array_equal(views.principal[1], [1.5, 2.5])
+
+
+def test_masks_are_true_where_not_black_and_whole_where_missing(tmp_path: Path, doc: dict[str, Any]) -> None:
+    grey = np.zeros((HEIGHT, WIDTH), np.uint8)
+    grey[1, 2], grey[0, 0] = 255, 1
+    opaque = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    opaque[..., 3] = 255  # black all over
+    iio.imwrite(tmp_path / "m_0.png", grey)
+    iio.imwrite(tmp_path / "m_1.png", opaque)
+    for i in range(2):
+        doc["frames"][i]["mask_path"] = f"m_{i}.png"
+    write_json(tmp_path, doc)
+    masks = read_blender(tmp_path, "train").masks
+    assert masks is not None
+    assert all(mask.dtype == bool for mask in masks)
+    np.testing.assert_array_equal(masks[0], grey != 0)
+    assert not masks[1].any()
+    assert masks[2].shape == (HEIGHT, WIDTH)
+    assert masks[2].all()
+
+
+def one_view(folder: Path, data: bytes) -> np.ndarray:
+    """The pixels that a file of these bytes is read as."""
+    write_scene(folder, n=1)
+    (folder / "train/r_0.png").write_bytes(data)
+    return read_blender(folder, "train").images[0]
+
+
+PALETTE = chunk(b"PLTE", bytes([10, 20, 30, 40, 50, 60]))  # colours 0 and 1
+RGB_ROW = b"\0\1\2\3\4\5\6"  # the filter, then two pixels
+TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        pytest.param(png(2, 1, 8, 0, b"\0\x07\xff"), [[[7] * 3, [255] * 3]], id="grey"),
+        pytest.param(png(2, 1, 1, 0, b"\0\x40"), [[[0] * 3, [255] * 3]], id="one bit"),
+        pytest.param(png(2, 1, 8, 4, b"\0\x07\x08\x09\x0a"), [[[7, 7, 7, 8], [9, 9, 9, 10]]], id="grey and alpha"),
+        pytest.param(png(2, 1, 8, 3, b"\0\0\1", PALETTE), TWO_COLOURS, id="palette"),
+        pytest.param(png(2, 1, 1, 3, b"\0\x40", PALETTE), TWO_COLOURS, id="palette of one bit"),
+        pytest.param(
+            png(2, 1, 8, 3, b"\0\0\1", PALETTE + chunk(b"tRNS", b"\x80")),
+            [[[10, 20, 30, 128], [40, 50, 60, 255]]],
+            id="palette with alpha",
+        ),
+        pytest.param(
+            png(2, 1, 8, 2, RGB_ROW, chunk(b"tRNS", b"\0\1\0\2\0\3")),
+            [[[1, 2, 3, 0], [4, 5, 6, 255]]],
+            id="one transparent colour",
+        ),
+        pytest.param(png(2, 1, 8, 2, RGB_ROW, chunk(b"gAMA", b"\0\0\0\x64")), [[[1, 2, 3], [4, 5, 6]]], id="gamma"),
+        pytest.param(png(2, 1, 8, 2, RGB_ROW) + b"more", [[[1, 2, 3], [4, 5, 6]]], id="bytes after the end"),
+    ],
+)
+def test_kinds_of_png(tmp_path: Path, data: bytes, expected: list[list[list[int]]]) -> None:
+    image = one_view(tmp_path, data)
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image, expected)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG", ".png"])
+def test_a_path_may_have_its_suffix(tmp_path: Path, suffix: str) -> None:
+    doc = write_scene(tmp_path, n=1)
+    path = tmp_path / f"train/photo.v2{suffix}"
+    iio.imwrite(path, pixels(0, channels=3))
+    doc["frames"][0]["file_path"] = f"train/photo.v2{suffix}"
+    write_json(tmp_path, doc)
+    np.testing.assert_array_equal(read_blender(tmp_path, "train").images[0], iio.imread(path))
+
+
+def test_a_dot_in_the_name_is_no_suffix(tmp_path: Path) -> None:
+    doc = write_scene(tmp_path, n=1)
+    (tmp_path / "train/r_0.png").rename(tmp_path / "train/r_0.5.png")
+    doc["frames"][0]["file_path"] = "train/r_0.5"
+    write_json(tmp_path, doc)
+    np.testing.assert_array_equal(read_blender(tmp_path, "train").images[0], pixels(0))
+
+
+def test_a_hundred_views_keep_the_order_of_the_json(tmp_path: Path) -> None:
+    doc = write_scene(tmp_path, n=100)
+    order = np.random.default_rng(0).permutation(100)
+    doc["frames"] = [doc["frames"][i] for i in order]
+    write_json(tmp_path, doc)
+    views = read_blender(tmp_path, "train")
+    assert views.names == tuple(f"./train/r_{i}" for i in order)
+    for i, image, matrix in zip(order, views.images, views.camera_to_worlds, strict=True):
+        np.testing.assert_array_equal(image, pixels(i))
+        np.testing.assert_array_equal(matrix, pose(i)[:3])
+
+
+def test_what_no_frame_lists_is_not_looked_at(tmp_path: Path) -> None:
+    doc = write_scene(tmp_path, split="test")
+    (tmp_path / "test/r_0_depth_0001.png").write_bytes(b"no image")
+    (tmp_path / "test/r_0_normal_0001.png").mkdir()
+    doc |= {"aabb_scale": [4, None], "k1": "?"}
+    doc["frames"][0]["time"] = {"unknown": True}
+    write_json(tmp_path, doc, "test")
+    assert len(read_blender(tmp_path, "test").images) == 3
+
+
+def test_poses_as_rounded_in_files_are_kept_as_written(tmp_path: Path, doc: dict[str, Any]) -> None:
+    for frame in doc["frames"]:
+        frame["transform_matrix"] = np.round(frame["transform_matrix"], 4).tolist()
+    write_json(tmp_path, doc)
+    expected = [frame["transform_matrix"][:3] for frame in doc["frames"]]
+    np.testing.assert_array_equal(read_blender(tmp_path, "train").camera_to_worlds, expected)
+
+
+def test_links_that_stay_inside_and_a_folder_behind_a_link(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    doc = write_scene(scene)
+    os.symlink("r_0.png", scene / "train/link.png")
+    doc["frames"][0]["file_path"] = "train/../train/link"
+    write_json(scene, doc)
+    os.symlink("scene", tmp_path / "by_link")
+    np.testing.assert_array_equal(read_blender(tmp_path / "by_link", "train").images[0], pixels(0))
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path, doc: dict[str, Any]) -> None:
+    (tmp_path / "transforms_train.json").write_text(json.dumps(doc), encoding="utf-8-sig")
+    assert len(read_blender(tmp_path, "train").names) == 3
+
+
+def test_has_split(tmp_path: Path, doc: dict[str, Any]) -> None:
+    assert has_split(tmp_path, "train")
+    assert not has_split(tmp_path, "val")
+    assert not has_split(tmp_path / "nowhere", "train")
