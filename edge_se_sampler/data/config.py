@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import ClassVar
 
 from edge_se_sampler.protocol import InstantiateConfig, PixelSamplerConfig
@@ -16,8 +15,6 @@ class VanillaDataManagerConfig(InstantiateConfig):
 
     _target: ClassVar[type | str] = "edge_se_sampler.data.datamanager:VanillaDataManager"
 
-    data: Path | None = None
-    """The Blender folder; --data does the same."""
     train_num_rays_per_batch: int | None = None
     """Rays of a training step; left out, the model's size decides."""
     pixel_sampler: PixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)

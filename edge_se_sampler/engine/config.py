@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
+
+import tyro
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.nerf.config import NeRFModelConfig
@@ -47,7 +49,7 @@ class TrainerConfig(InstantiateConfig):
 
     _target: ClassVar[type | str] = "edge_se_sampler.engine.trainer:Trainer"
 
-    method_name: str = "edge-se-nerf"
+    method_name: Annotated[str, tyro.conf.Suppress] = "edge-se-nerf"
     """Name of the method, part of the run folder's path."""
     data: Path | None = None
     """The Blender folder (transforms_train.json and so on) to train on."""

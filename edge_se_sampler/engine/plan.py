@@ -31,7 +31,7 @@ def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
         steps_per_eval_image=max(1, iterations // 10) if preview is None else preview,
         pipeline=replace(
             config.pipeline,
-            datamanager=replace(manager, data=config.data, train_num_rays_per_batch=rays),
+            datamanager=replace(manager, train_num_rays_per_batch=rays),
             model=resolved(model, size),
         ),
         optimizer=replace(

@@ -130,7 +130,6 @@ def config_digest(config: TrainerConfig) -> str:
     values = config_to_json(config)
     for free in ("output_dir", "data", "max_seconds", "steps_per_save"):
         del values[free]
-    del values["pipeline"]["datamanager"]["data"]
     del values["machine"]["device_type"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 

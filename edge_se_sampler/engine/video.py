@@ -1,0 +1,50 @@
+"""Pictures -> a GIF or an MP4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from edge_se_sampler.engine.checkpoint import write_atomically
+from edge_se_sampler.errors import InputError
+
+
+def check_video_path(path: Path) -> None:
+    """Refuse early what `write_video` could not write.
+
+    Raises:
+        InputError: neither .gif nor .mp4, the [video] extra is missing, or there is no such folder.
+    """
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise InputError(f"--output-path {path}: must end in .gif or .mp4")
+    if not path.parent.is_dir():
+        raise InputError(f"--output-path {path}: no such folder {path.parent}")
+    if path.suffix.lower() == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError:
+            raise InputError("mp4 needs the [video] extra: pip install 'edge-se-sampler[video]', or use .gif") from None
+
+
+def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) -> None:
+    """Write (H, W, 3) float pictures in [0, 1].
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    eight_bit = np.stack([np.rint(np.clip(frame, 0, 1) * 255).astype(np.uint8) for frame in frames])
+    if path.suffix.lower() == ".gif":
+        content = iio.imwrite("<bytes>", eight_bit, extension=".gif", duration=1000 / frames_per_second, loop=0)
+        write_atomically(path, content)
+        return
+    even = eight_bit[:, : eight_bit.shape[1] // 2 * 2, : eight_bit.shape[2] // 2 * 2]  # what the codec takes
+    temporary = path.with_name(f".{path.stem}.tmp.mp4")
+    try:
+        iio.imwrite(temporary, even, fps=frames_per_second, macro_block_size=2)
+        temporary.replace(path)
+    except OSError as problem:
+        raise InputError(f"{path}: cannot be written ({problem.strerror or problem})") from problem
+    finally:
+        temporary.unlink(missing_ok=True)
