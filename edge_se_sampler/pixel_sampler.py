@@ -23,7 +23,6 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
 from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.ranking import keep_by_rank
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 from edge_se_sampler.schedule import phase_at
 from edge_se_sampler.streams import Stream, stream
 
@@ -51,7 +50,7 @@ class ImportantPixels:
 
     def __init__(self, config: Any, **kwargs: Any) -> None:
         # hosts share one config between training and evaluation, and write into it
-        super().__init__(copy.copy(config), **kwargs)
+        super().__init__(copy.copy(config), **kwargs)  # pyright: ignore[reportCallIssue]
         self.config.check()
         self.background: tuple[float, float, float] = kwargs.get("background_color") or WHITE
         self._squared_error: SquaredError | None = None
@@ -180,7 +179,7 @@ class ImportantPixels:
         with torch.no_grad():
             errors = self._squared_error(candidates)
         kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION))
-        pixels = {key: value[kept.index.to(value.device)] for key, value in candidates.items()}
+        pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
         if self.config.importance_weight:
             share = count / len(drawn)  # what every candidate's inclusion would be without ranks
             pixels["weight"] = (kept.inclusion / share).to(batch.device) ** -self.config.importance_weight
@@ -189,5 +188,3 @@ class ImportantPixels:
 
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
     """Important-pixel sampling on our own protocol's base."""
-
-    config: EdgeSEPixelSamplerConfig

@@ -14,7 +14,7 @@ error. The true rank is meant, and taken.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -30,10 +30,11 @@ def error_ranks(squared_error: np.ndarray, rng: np.random.Generator) -> np.ndarr
     return ranks
 
 
-class Kept(NamedTuple):
+@dataclass(frozen=True)
+class Kept:
     """The candidates that are trained on."""
 
-    index: Tensor
+    rows: Tensor
     """(N,) int64, ascending: rows of the candidates, on the device of the errors."""
     inclusion: Tensor
     """(N,) float32: probability with which each was kept, given tau: 1 - exp(-w_i tau). Weighting by its inverse

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import image_batch
 from edge_se_sampler.distribution import PixelTable
 from edge_se_sampler.edges import luma, unit_float
+from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
 from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
@@ -102,10 +104,6 @@ def save_figure(figure, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    import io
-
-    from edge_se_sampler.engine.checkpoint import write_atomically
-
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120)
     require_pyplot().close(figure)

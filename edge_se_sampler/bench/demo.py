@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler import __version__
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.made.folder import make_scenes
-from edge_se_sampler.engine.checkpoint import write_atomically
 from edge_se_sampler.engine.config import MachineConfig
-from edge_se_sampler.engine.evaluation import evaluate, psnr, shade_behind, target_image
+from edge_se_sampler.engine.evaluation import evaluate, psnr, target_image
+from edge_se_sampler.engine.files import write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
@@ -62,7 +60,97 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
         made[0].rename(scene)
         made[0].parent.rmdir()
     outcomes = [_train(method, scene, workplace, seed) for method in METHODS]
-    target, background = _ground_truth(scene, workplace, outcomes)
+    target, background = _ground_truth(scene)
     _write_json(output_dir / "demo.json", outcomes, background, seed, time.monotonic() - began)
-    _draw(output_dir / "demo.png", outcomes, target, background, seed)
+    _draw(output_dir / "demo.png", outcomes, target, background)
     return outcomes
+
+
+def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
+    config = registered_methods()[method].specification.config
+    trainer = prepare(
+        replace(
+            config,
+            data=scene,
+            output_dir=workplace / "runs",
+            max_num_iterations=ITERATIONS,
+            steps_per_eval_image=ITERATIONS // 20,
+            machine=MachineConfig(seed=seed, device_type="cpu"),
+        )
+    )
+    trainer.train()
+    if trainer.stop_requested:
+        raise KeyboardInterrupt
+    metrics = trainer.run.metrics()
+    first: list[np.ndarray] = []
+    results = evaluate(
+        trainer.pipeline.model, test_pictures(trainer.config), lambda _, __, rendered: first.append(rendered)
+    )
+    return Outcome(
+        method,
+        trainer.elapsed,
+        [line for line in metrics if "loss" in line],
+        [line for line in metrics if "val_psnr" in line],
+        results | {"config": config_to_json(trainer.config), "run": str(trainer.run.path)},
+        first[0],
+    )
+
+
+def _ground_truth(scene: Path) -> tuple[np.ndarray, float]:
+    """The first test view, and the PSNR over the test views of answering with the background alone."""
+    config = registered_methods()["vanilla-nerf"].specification.config
+    pictures = test_pictures(replace(config, data=scene))
+    errors = [((target_image(picture, 1.0) - 1.0) ** 2).mean() for picture in pictures]
+    return target_image(pictures[0], 1.0), float(np.mean([psnr(error) for error in errors]))
+
+
+def _write_json(path: Path, outcomes: list[Outcome], background: float, seed: int, seconds: float) -> None:
+    methods = {
+        outcome.method: {
+            "training_seconds": round(outcome.seconds, 2),
+            "results": outcome.results,
+            "loss": outcome.loss,
+            "validation": outcome.validation,
+        }
+        for outcome in outcomes
+    }
+    content = {
+        "command": f"edge-se demo --seed {seed}",
+        "scene": {"name": SCENE, "placement": "shifted", "offset": OFFSET, "size": SIZE},
+        "seed": seed,
+        "iterations": ITERATIONS,
+        "background_psnr": background,
+        "total_seconds": round(seconds, 1),
+        "machine": machine(),
+        "methods": methods,
+    }
+    write_json(path, content)
+
+
+def _draw(path: Path, outcomes: list[Outcome], target: np.ndarray, background: float) -> None:
+    pyplot = require_pyplot()
+    figure = pyplot.figure(figsize=(10.5, 7.4))
+    grid = figure.add_gridspec(2, 6, height_ratios=(1, 0.95), hspace=0.28, wspace=0.9)
+    pictures = [("ground truth", target)]
+    pictures += [
+        (f"{METHODS[outcome.method]}: {outcome.results['psnr']:.2f} dB", outcome.picture) for outcome in outcomes
+    ]
+    for i, (title, picture) in enumerate(pictures):
+        axis = figure.add_subplot(grid[0, 2 * i : 2 * i + 2])
+        axis.imshow(picture, interpolation="nearest")
+        axis.set_title(title)
+        axis.set(xticks=[], yticks=[])
+    curves = figure.add_subplot(grid[1, :3]), figure.add_subplot(grid[1, 3:])
+    for outcome in outcomes:
+        name, color = METHODS[outcome.method], COLORS[outcome.method]
+        measured = [line["val_psnr"] for line in outcome.validation]
+        for axis, x in zip(curves, ("step", "seconds"), strict=True):
+            axis.plot([line[x] for line in outcome.validation], measured, color=color, label=name)
+    for axis, x in zip(curves, ("iterations", "seconds of training"), strict=True):
+        axis.axhline(background, color="black", ls=":", lw=1, label="background alone")
+        axis.set(xlabel=x, ylabel="PSNR of a held-out view [dB]")
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    curves[0].legend(frameon=False, loc="upper left")
+    figure.suptitle("The same network, the same initial weights, the same number of iterations", y=0.97)
+    save_figure(figure, path)

@@ -19,4 +19,3 @@ class VanillaDataManagerConfig(InstantiateConfig):
     """Rays of a training step; left out, the model's size decides."""
     pixel_sampler: PixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
     """Which pixels are trained on. In Python any host's config may stand here, nerfstudio's own included."""
-

@@ -7,10 +7,8 @@ Loaded with weights_only=True, so a pickle in it is refused, never run.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
-import os
 import pickle
 import re
 from pathlib import Path
@@ -18,6 +16,7 @@ from typing import Any
 
 import torch
 
+from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 
 MAGIC = b"edge-se-checkpoint 1 "
@@ -44,32 +43,6 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
         if older != path and _step(older) < step:
             older.unlink(missing_ok=True)
     return path
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content that is safely on the disk, or leave it as it was.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        with contextlib.suppress(PermissionError):  # a folder that cannot be opened cannot be flushed
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-    except OSError as problem:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        reason = problem.strerror or str(problem)
-        raise InputError(f"{path}: cannot be written ({reason}); what was there before is untouched") from problem
 
 
 def latest_checkpoint(folder: Path) -> Path:

@@ -92,7 +92,7 @@ def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
     if not hasattr(cv2, "quality"):
         return None
     scaled = [np.rint(picture * 255).astype(np.uint8) for picture in (first, second)]
-    score, _ = cv2.quality.QualitySSIM_compute(scaled[0], scaled[1])
+    score, _ = cv2.quality.QualitySSIM_compute(scaled[0], scaled[1])  # pyright: ignore[reportAttributeAccessIssue]
     return float(np.mean(score[:3]))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import os
 import time
@@ -11,11 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.engine.checkpoint import write_atomically
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import write_atomically, write_image, write_json
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 
@@ -37,20 +37,14 @@ class RunFolder:
         stamp = time.strftime("%Y-%m-%d_%H%M%S")
         try:
             parent.mkdir(parents=True, exist_ok=True)
-            for attempt in range(1000):
-                path = parent / (f"{stamp}-{attempt}" if attempt else stamp)
-                try:
-                    path.mkdir()
-                    break
-                except FileExistsError:
-                    continue
+            path = _new_folder(parent, stamp)
             (path / "checkpoints").mkdir()
             (path / "previews").mkdir()
         except OSError as problem:
             reason = problem.strerror or str(problem)
             raise InputError(f"--output-dir {config.output_dir}: cannot be written ({reason})") from problem
         run = cls(path)
-        write_atomically(run.path / "config.json", json.dumps(config_to_json(config), indent=1).encode() + b"\n")
+        write_json(run.path / "config.json", config_to_json(config))
         return run
 
     @property
@@ -110,14 +104,16 @@ class RunFolder:
         write_image(self.path / "previews" / f"step-{step:09d}.png", image)
 
 
-def write_image(path: Path, image: np.ndarray) -> None:
-    """Save a picture, (H, W, 3) float in [0, 1].
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    eight_bit = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    write_atomically(path, iio.imwrite("<bytes>", eight_bit, extension=".png"))
+def _new_folder(parent: Path, stamp: str) -> Path:
+    """parent/stamp, or the first of stamp-1, stamp-2, ... that is free."""
+    for attempt in itertools.count():
+        path = parent / (f"{stamp}-{attempt}" if attempt else stamp)
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        return path
+    raise AssertionError  # count() does not end
 
 
 def config_to_json(config: TrainerConfig) -> dict[str, Any]:

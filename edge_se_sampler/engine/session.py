@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import dataclasses
+import math
 from pathlib import Path
 
 from edge_se_sampler.data.blender import Views, has_split, read_blender
@@ -17,6 +18,7 @@ from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.sampling_settings import SamplingSettings
 
 
 def prepare(config: TrainerConfig) -> Trainer:
@@ -30,6 +32,7 @@ def prepare(config: TrainerConfig) -> Trainer:
     plan = planned(config, views)
     plan.pipeline.datamanager.pixel_sampler.setup(num_rays_per_batch=1)  # refuses bad settings before a folder is made
     run = RunFolder.create(plan)
+    keep_freed_memory()
     return plan.setup(run=run, views=views, preview=preview, device=device)
 
 
@@ -43,6 +46,7 @@ def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
     latest_checkpoint(run.checkpoints)
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
+    keep_freed_memory()
     trainer = config.setup(run=run, views=views, preview=preview, device=device)
     trainer.resume()
     return trainer
@@ -77,11 +81,40 @@ def test_pictures(config: TrainerConfig) -> list[Picture]:
     raise InputError(f"{config.data}: no held-out views; transforms_test.json or transforms_val.json is needed")
 
 
-def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
-    """Training views, and the first validation (or test) view to look at while training."""
+def read_views(config: TrainerConfig) -> Views:
+    """The training views of a config's data.
+
+    Raises:
+        InputError: no data given, or bad data.
+    """
     if config.data is None:
         raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
-    views = read_blender(config.data, "train")
+    return read_blender(config.data, "train")
+
+
+def summary(config: TrainerConfig, run: RunFolder) -> str:
+    """A planned run in a few lines."""
+    model, manager, sampler = (
+        config.pipeline.model,
+        config.pipeline.datamanager,
+        config.pipeline.datamanager.pixel_sampler,
+    )
+    lines = [
+        f"run      {run.path}",
+        f"model    {model.size}: {model.depth} x {model.width}, {model.num_coarse_samples} + "
+        f"{model.num_importance_samples} samples a ray",
+        f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
+    ]
+    if isinstance(sampler, SamplingSettings):
+        switch = math.ceil(sampler.early_length(config.max_num_iterations or 0))
+        lines.append(f"pixels   {sampler.early} for {switch} iterations, then {sampler.late}")
+    return "\n".join(lines)
+
+
+def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
+    """Training views, and the first validation (or test) view to look at while training."""
+    views = read_views(config)
+    assert config.data is not None
     for split in ("val", "test"):
         if has_split(config.data, split):
             held_out = read_blender(config.data, split)

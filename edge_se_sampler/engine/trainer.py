@@ -196,4 +196,3 @@ def choose_device(device_type: str) -> str:
     if device_type == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return device_type
-

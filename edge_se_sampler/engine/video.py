@@ -7,7 +7,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.engine.checkpoint import write_atomically
+from edge_se_sampler.engine.files import eight_bit, write_atomically
 from edge_se_sampler.errors import InputError
 
 
@@ -34,12 +34,12 @@ def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) ->
     Raises:
         InputError: it cannot be written.
     """
-    eight_bit = np.stack([np.rint(np.clip(frame, 0, 1) * 255).astype(np.uint8) for frame in frames])
+    stacked = eight_bit(np.stack(frames))
     if path.suffix.lower() == ".gif":
-        content = iio.imwrite("<bytes>", eight_bit, extension=".gif", duration=1000 / frames_per_second, loop=0)
+        content = iio.imwrite("<bytes>", stacked, extension=".gif", duration=1000 / frames_per_second, loop=0)
         write_atomically(path, content)
         return
-    even = eight_bit[:, : eight_bit.shape[1] // 2 * 2, : eight_bit.shape[2] // 2 * 2]  # what the codec takes
+    even = stacked[:, : stacked.shape[1] // 2 * 2, : stacked.shape[2] // 2 * 2]  # what the codec takes
     temporary = path.with_name(f".{path.stem}.tmp.mp4")
     try:
         iio.imwrite(temporary, even, fps=frames_per_second, macro_block_size=2)

@@ -1,0 +1,43 @@
+"""Where a number was measured."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+from typing import Any
+
+import numpy
+import torch
+
+from edge_se_sampler import __version__
+
+
+def machine() -> dict[str, Any]:
+    """Versions and hardware, for the json of every result."""
+    return {
+        "edge_se_sampler": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": numpy.__version__,
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+        return names[0]
+    except (OSError, IndexError):
+        return platform.processor()
+
+
+def peak_memory() -> int:
+    """Bytes that this process has held resident at most so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if platform.system() == "Darwin" else peak * 1024

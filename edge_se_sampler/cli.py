@@ -1,0 +1,305 @@
+"""`edge-se`: the command line. Torch is imported only by the commands that compute, so that --help is quick."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+
+
+@dataclass(frozen=True)
+class Demo:
+    """See it: Random against Edge + SE on an off-centre, mostly white scene, in a few minutes."""
+
+    output_dir: Path = Path()
+    """Where demo.png, demo.json and the folder demo/ (scene and runs) are left."""
+    seed: int = 0
+    """Of weights, pixels and jitter; both methods start from the same weights."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.demo import METHODS, demo
+
+        for outcome in demo(self.output_dir, self.seed):
+            print(
+                f"{METHODS[outcome.method]:>9}: {outcome.results['psnr']:.2f} dB in {outcome.seconds:.0f} s of training"
+            )
+        print(f"see {self.output_dir / 'demo.png'} and {self.output_dir / 'demo.json'}")
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Make the seven scenes (stand-ins for NeRF's) as Blender folders."""
+
+    out: Path
+    """Folder that receives one folder a scene; nothing existing is overwritten."""
+    names: tuple[str, ...] = ("chair", "drums", "ficus", "hotdog", "bricks", "materials", "mic")
+    """Which scenes."""
+    size: int = 100
+    """Rows and columns of an image."""
+    num_train: int = 50
+    """Training views."""
+    num_val: int = 5
+    """Validation views."""
+    num_test: int = 10
+    """Test views."""
+    placement: Literal["centered", "shifted", "rotated"] = "centered"
+    """Object in the middle; moved in the image plane (cx, cy in the json); or cameras turned away from it."""
+    offset: tuple[float, float] = (0.2, 0.15)
+    """Where the object goes from the middle, right and down, as fractions of the image (shifted, rotated)."""
+    seed: int = 0
+    """Of the training and validation poses."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.made.folder import make_scenes
+        from edge_se_sampler.engine.progress import Progress
+
+        progress = Progress(len(self.names) * (self.num_train + self.num_val + self.num_test), "rendering scenes")
+        try:
+            made = make_scenes(
+                self.out,
+                self.names,
+                size=self.size,
+                num_train=self.num_train,
+                num_val=self.num_val,
+                num_test=self.num_test,
+                placement=self.placement,
+                offset=self.offset,
+                seed=self.seed,
+                progress=lambda done, _: progress.update(done),
+            )
+        finally:
+            progress.close()
+        for path in made:
+            print(path)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a method on a Blender folder: edge-se train METHOD --data DIR."""
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Continue an interrupted run in place, under its own settings."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    max_seconds: float | None = None
+    """Stop this session after that time."""
+
+    def run(self) -> None:
+        from edge_se_sampler.engine.run_folder import RunFolder
+        from edge_se_sampler.engine.session import prepare_resume
+
+        _train(prepare_resume(RunFolder(self.run_folder), self.max_seconds))
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Measure a run on its held-out views."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    output_path: Path = Path("eval.json")
+    """The json to write."""
+    render_output_path: Path | None = None
+    """Folder for the rendered views (ground truth | rendering)."""
+
+    def run(self) -> None:
+        from edge_se_sampler.engine.reports import evaluate_run
+
+        results = evaluate_run(self.run_folder, self.output_path, self.render_output_path)
+        print(f"PSNR {results['psnr']:.2f} dB over {results['num_images']} views; see {self.output_path}")
+
+
+@dataclass(frozen=True)
+class Render:
+    """Show a run as a video."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    output_path: Path = Path("render.gif")
+    """The video to write, .gif or .mp4 (extra [video])."""
+    kind: Literal["spiral", "test"] = "spiral"
+    """A turn around the scene, or the held-out cameras."""
+    num_frames: int = 60
+    """Frames of the spiral."""
+    frames_per_second: int = 20
+    """Speed of the video."""
+
+    def run(self) -> None:
+        from edge_se_sampler.engine.reports import render_run
+
+        render_run(self.run_folder, self.output_path, self.kind, self.num_frames, self.frames_per_second)
+        print(self.output_path)
+
+
+@dataclass(frozen=True)
+class Show:
+    """Look at one's own images as a sampler sees them: view, probability, and where a batch falls."""
+
+    data: Path
+    """A Blender folder."""
+    output_path: Path = Path("show.png")
+    """The picture to write."""
+    strategy: Literal["uniform", "precrop", "edge"] = "edge"
+    """Which way of drawing is shown."""
+    num_views: int = 3
+    """How many training views."""
+    seed: int = 0
+    """Of the draw."""
+    pixel_sampler: EdgeSEPixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
+    """Settings of the sampler."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.show import show
+
+        if self.num_views < 1:
+            raise InputError(f"--num-views is {self.num_views}: must be at least 1")
+        views = read_blender(self.data, "train")
+        show(views, self.pixel_sampler, self.strategy, self.output_path, self.num_views, self.seed)
+        print(self.output_path)
+
+
+@dataclass(frozen=True)
+class Methods:
+    """List every method and where it comes from."""
+
+    def run(self) -> None:
+        for name, method in registered_methods().items():
+            print(f"{name:<20} {method.specification.description}  [{method.origin}]")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure: edge-se bench samplers times tables and draws."""
+
+    what: Annotated[Literal["samplers"], tyro.conf.Positional]
+    """samplers: building tables, drawing, selecting, and the memory of SE."""
+    output_path: Path | None = None
+    """A json to write besides printing."""
+    images: int = 100
+    """Images in the tables."""
+    size: int = 800
+    """Rows and columns of an image."""
+    draws: int = 4096
+    """Pixels a draw."""
+    repeats: int = 200
+    """Rounds; the median of each kind of draw is reported."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.samplers import bench_samplers, table_of
+        from edge_se_sampler.engine.files import write_json
+
+        if min(self.images, self.size, self.draws, self.repeats) < 1:
+            raise InputError("--images, --size, --draws and --repeats must be at least 1")
+        result = bench_samplers(self.images, self.size, self.draws, self.repeats)
+        print(table_of(result))
+        if self.output_path is not None:
+            write_json(self.output_path, result)
+
+
+COMMANDS: dict[str, type] = {
+    "demo": Demo,
+    "scenes": Scenes,
+    "train": Train,
+    "resume": Resume,
+    "eval": Eval,
+    "render": Render,
+    "show": Show,
+    "methods": Methods,
+    "bench": Bench,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command; exit code 2 for bad input, 1 for a training that diverged, 130 for Ctrl-C."""
+    try:
+        _run(list(sys.argv[1:] if arguments is None else arguments))
+    except InputError as problem:
+        _leave(str(problem), 2)
+    except FloatingPointError as problem:
+        _leave(str(problem), 1)
+    except KeyboardInterrupt:
+        _leave("interrupted", 130)
+
+
+def _leave(message: str, code: int) -> None:
+    print(f"edge-se: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _run(arguments: list[str]) -> None:
+    if arguments == ["--version"]:
+        from edge_se_sampler import __version__
+
+        print(__version__)
+    elif arguments[:1] == ["train"]:
+        methods = {name: method.specification for name, method in registered_methods().items()}
+        kind = tyro.extras.subcommand_type_from_defaults(
+            {name: method.config for name, method in methods.items()},
+            {name: method.description for name, method in methods.items()},
+        )
+        config = _parse(kind, arguments[1:], "edge-se train", list(methods))
+        from edge_se_sampler.engine.session import prepare
+
+        _train(prepare(config))
+    else:
+        kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items())  # type: ignore[valid-type]
+        _parse(Union[kinds], arguments, "edge-se", list(COMMANDS)).run()  # noqa: UP007
+
+
+def _parse(kind: Any, arguments: list[str], program: str, names: list[str]) -> Any:
+    """tyro's parse, its boxed complaint turned into one line."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(tyro.conf.configure(tyro.conf.FlagConversionOff)(kind), args=arguments, prog=program)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise InputError(_one_line(complaint.getvalue(), arguments, program, names)) from None
+
+
+def _one_line(complaint: str, arguments: list[str], program: str, names: list[str]) -> str:
+    """The gist of tyro's complaint, with the nearest name that exists."""
+    if not arguments or (arguments[0] not in names and not arguments[0].startswith("-")):
+        near = difflib.get_close_matches(arguments[0], names, n=1, cutoff=0.4) if arguments else []
+        hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(names)}"
+        return f"{program} has no {arguments[0]!r}; {hint}" if arguments else f"{program} what? {hint}"
+    lines = [line.strip("│╭╮╰╯ ") for line in complaint.splitlines()]
+    body = " ".join(line for line in lines[1:] if line)
+    body, *suggestions = re.split(r" ?─{4,} ?", body)
+    nearest = re.search(r"(--[\w.-]+)", " ".join(suggestions[:1])) if "Perhaps" in "".join(suggestions[:1]) else None
+    hint = f"; did you mean {nearest.group(1)}?" if nearest else ""
+    return f"{body}{hint} (see {program} {arguments[0]} --help)"
+
+
+def _train(trainer: Any) -> None:
+    """Train and say where the result is."""
+    from edge_se_sampler.engine.session import summary
+
+    print(summary(trainer.config, trainer.run), flush=True)
+    trainer.train()
+    if trainer.stop_requested:
+        _leave(
+            f"stopped after {trainer.next_step} iterations and saved; continue: edge-se resume {trainer.run.path}", 130
+        )
+    print(f"{trainer.next_step} iterations in {trainer.elapsed:.1f} s; look: edge-se eval {trainer.run.path}")
+
+
+if __name__ == "__main__":
+    main()

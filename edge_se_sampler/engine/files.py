@@ -1,0 +1,63 @@
+"""Files that are whole or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+
+from edge_se_sampler.errors import InputError
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file by new content that is safely on the disk, or leave it as it was.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        with contextlib.suppress(PermissionError):  # a folder that cannot be opened cannot be flushed
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+    except OSError as problem:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        reason = problem.strerror or str(problem)
+        raise InputError(f"{path}: cannot be written ({reason}); what was there before is untouched") from problem
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write valid json (a NaN is an error, not a token).
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    write_atomically(path, json.dumps(content, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Save a picture, (H, W, 3) float in [0, 1].
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    write_atomically(path, iio.imwrite("<bytes>", eight_bit(image), extension=".png"))
+
+
+def eight_bit(image: np.ndarray) -> np.ndarray:
+    """Floats in [0, 1] (clipped) as uint8."""
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

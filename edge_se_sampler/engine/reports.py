@@ -1,0 +1,86 @@
+"""What eval, render and bench leave: json files, pictures, videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_se_sampler.engine.camera_path import spiral
+from edge_se_sampler.engine.evaluation import (
+    Picture,
+    evaluate,
+    pictures_of,
+    render_rays,
+    shade_behind,
+    target_image,
+)
+from edge_se_sampler.engine.files import write_image, write_json
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import load_model, read_views, test_pictures
+from edge_se_sampler.engine.video import check_video_path, write_video
+from edge_se_sampler.errors import InputError
+
+
+def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) -> dict[str, Any]:
+    """Measure a run's last checkpoint on its held-out views and write nerfstudio's eval json.
+
+    Raises:
+        InputError: a bad run, or an output that cannot be written.
+    """
+    if not output_path.parent.is_dir():
+        raise InputError(f"--output-path {output_path}: no such folder {output_path.parent}")
+    config, model, checkpoint = load_model(RunFolder(run))
+    pictures = test_pictures(config)
+    if render_output_path is not None:
+        try:
+            render_output_path.mkdir(parents=True, exist_ok=True)
+        except OSError as problem:
+            raise InputError(f"--render-output-path {render_output_path}: {problem.strerror}") from problem
+    progress = Progress(len(pictures), "evaluating")
+
+    def each(i: int, picture: Picture, rendered: np.ndarray) -> None:
+        progress.update(i + 1)
+        if render_output_path is not None:
+            pair = np.concatenate((target_image(picture, shade_behind(model)), rendered), axis=1)
+            write_image(render_output_path / f"{i:04d}.png", pair)
+
+    results = evaluate(model, pictures, each)
+    progress.close()
+    content = {
+        "experiment_name": config.experiment_name,
+        "method_name": config.method_name,
+        "checkpoint": str(checkpoint),
+        "results": results,
+    }
+    write_json(output_path, content)
+    return results
+
+
+def render_run(run: Path, output_path: Path, kind: str, num_frames: int, frames_per_second: int) -> None:
+    """Render a run's last checkpoint along a spiral or at its held-out cameras, as a video.
+
+    Raises:
+        InputError: a bad run, or an output that cannot be written.
+    """
+    check_video_path(output_path)
+    if num_frames < 1 or frames_per_second < 1:
+        raise InputError("--num-frames and --frames-per-second must be at least 1")
+    config, model, _ = load_model(RunFolder(run))
+    pictures = test_pictures(config)
+    if kind == "spiral":
+        train = pictures_of(read_views(config))
+        generator = type(train[0].generator)(spiral(train[0].generator.cameras, num_frames))
+        pictures = [Picture(f"{i}", train[0].image, generator, i) for i in range(num_frames)]
+    progress = Progress(len(pictures), "rendering")
+    frames = []
+    for i, picture in enumerate(pictures):
+        rendered = render_rays(model, picture.rays(model.device))
+        frames.append(rendered.reshape(*picture.image.shape[:2], 3).numpy())
+        progress.update(i + 1)
+    progress.close()
+    if len({frame.shape for frame in frames}) > 1:
+        raise InputError("the held-out views differ in size and make no video; use --kind spiral")
+    write_video(output_path, frames, frames_per_second)
