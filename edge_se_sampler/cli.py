@@ -298,7 +298,10 @@ def _train(trainer: Any) -> None:
         _leave(
             f"stopped after {trainer.next_step} iterations and saved; continue: edge-se resume {trainer.run.path}", 130
         )
-    print(f"{trainer.next_step} iterations in {trainer.elapsed:.1f} s; look: edge-se eval {trainer.run.path}")
+    print(f"{trainer.next_step} of {trainer.planned_steps} iterations in {trainer.elapsed:.1f} s of training")
+    print(f"measure it: edge-se eval {trainer.run.path}")
+    if trainer.next_step < trainer.planned_steps:
+        print(f"continue:   edge-se resume {trainer.run.path}")
 
 
 if __name__ == "__main__":

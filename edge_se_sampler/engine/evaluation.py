@@ -72,9 +72,15 @@ def target_image(picture: Picture, shade: float) -> np.ndarray:
 
 
 def render_view(model: NeRFModel, picture: Picture) -> tuple[np.ndarray, float]:
-    """A view's rendering (H, W, 3) in [0, 1] and its PSNR."""
+    """A view's rendering (H, W, 3) in [0, 1] and its PSNR.
+
+    Raises:
+        FloatingPointError: the model renders values that are not finite.
+    """
     height, width = picture.image.shape[:2]
     rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
+    if not np.isfinite(rendered).all():
+        raise FloatingPointError("the model's colours are not finite: training diverged; try a lower --optimizer.lr")
     error = (rendered.astype(np.float64) - target_image(picture, shade_behind(model))) ** 2
     return rendered, psnr(error.mean())
 

@@ -125,7 +125,16 @@ class Trainer:
         return (optimizer.lr or 0.0) * optimizer.final_fraction ** (step / self.planned_steps)
 
     def save(self) -> None:
-        """Write a checkpoint of the steps done so far."""
+        """Write a checkpoint of the steps done so far.
+
+        Raises:
+            FloatingPointError: a weight is not finite; such a state is not worth keeping.
+            InputError: it cannot be written.
+        """
+        if not all(torch.isfinite(weight).all() for weight in self.pipeline.model.parameters()):
+            raise FloatingPointError(
+                f"a weight is not finite after step {self.next_step - 1}; try a lower --optimizer.lr"
+            )
         state = {
             "step": self.next_step - 1,
             "elapsed": self.elapsed,

@@ -34,11 +34,11 @@ class NeRFField(nn.Module):
         width, depth = config.width or 0, config.depth or 0
         encoded = encoded_size(3, self.position_frequencies)
         widths = [encoded] + [width + encoded if i == SKIP_AFTER else width for i in range(1, depth)]
-        self.layers = nn.ModuleList(nn.Linear(size, width) for size in widths)
-        self.density = nn.Linear(width, 1)
-        self.feature = nn.Linear(width, width)
-        self.view = nn.Linear(width + encoded_size(3, self.direction_frequencies), width // 2)
-        self.color = nn.Linear(width // 2, 3)
+        self.layers = nn.ModuleList(_linear(size, width) for size in widths)
+        self.density = _linear(width, 1)
+        self.feature = _linear(width, width)
+        self.view = _linear(width + encoded_size(3, self.direction_frequencies), width // 2)
+        self.color = _linear(width // 2, 3)
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 initialize(layer, config.initialization, rng)
@@ -79,6 +79,11 @@ class NeRFField(nn.Module):
         return F.relu(h, inplace=True)
 
 
+def _linear(in_size: int, out_size: int) -> nn.Linear:
+    """A layer still to be initialised; torch's own way would draw from its global generator."""
+    return nn.utils.skip_init(nn.Linear, in_size, out_size)
+
+
 def initialize(layer: nn.Linear, how: str, rng: np.random.Generator) -> None:
     """Fill a layer with seeded initial weights.
 
@@ -89,4 +94,6 @@ def initialize(layer: nn.Linear, how: str, rng: np.random.Generator) -> None:
     bound = (6 / (in_size + out_size)) ** 0.5 if how == "xavier" else in_size**-0.5
     with torch.no_grad():
         layer.weight.copy_(torch.from_numpy(rng.uniform(-bound, bound, (out_size, in_size))))
-        layer.bias.copy_(torch.from_numpy(rng.uniform(-bound, bound, out_size)) if how == "torch" else 0 * layer.bias)
+        layer.bias.zero_()
+        if how == "torch":
+            layer.bias.copy_(torch.from_numpy(rng.uniform(-bound, bound, out_size)))

@@ -1,0 +1,65 @@
+"""What several tests share: a tiny made scene and the command line, called in this process."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from edge_se_sampler.cli import main
+from edge_se_sampler.data.made import make_scenes
+
+
+@pytest.fixture(scope="session")
+def _made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    return make_scenes(folder, ["mic"], size=24, num_train=3, num_val=1, num_test=1)[0]
+
+
+@pytest.fixture
+def scene(_made_once: Path, tmp_path: Path) -> Path:
+    """A Blender folder of its own: 3 training views, 1 val, 1 test, 24 x 24."""
+    return Path(shutil.copytree(_made_once, tmp_path / "scene"))
+
+
+@dataclass(frozen=True)
+class Answer:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def edge_se(capfd: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
+    """Call the command line: edge_se("train", "edge-nerf", ...) -> exit code, stdout, stderr."""
+
+    def call(*arguments: object) -> Answer:
+        capfd.readouterr()
+        code = 0
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        captured = capfd.readouterr()
+        return Answer(code, captured.out, captured.err)
+
+    return call
+
+
+SMALL = (
+    "--max-num-iterations", "6", "--pipeline.datamanager.train-num-rays-per-batch", "16",
+    "--pipeline.model.num-coarse-samples", "8", "--pipeline.model.num-importance-samples", "8",
+    "--machine.device-type", "cpu",
+)  # fmt: skip
+"""Flags of a training that takes a moment."""
+
+
+@pytest.fixture
+def run(scene: Path, tmp_path: Path, edge_se: Callable[..., Answer]) -> Path:
+    """A finished run of edge-se-nerf on the scene."""
+    answer = edge_se("train", "edge-se-nerf", "--data", scene, "--output-dir", tmp_path / "outputs", *SMALL)
+    assert answer.code == 0, answer.err
+    return next((tmp_path / "outputs" / "scene" / "edge-se-nerf").iterdir())

@@ -1,0 +1,145 @@
+"""Checkpoints: whole or not there, and never a pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint, load_checkpoint, save_checkpoint
+from edge_se_sampler.engine.files import write_atomically
+from edge_se_sampler.errors import InputError
+
+
+def state(value: float, digest: str = "d") -> dict:
+    return {"step": 1, "config_digest": digest, "model": {"w": torch.full((50, 50), value)}}
+
+
+def test_what_is_saved_is_loaded_and_older_ones_go(tmp_path: Path):
+    save_checkpoint(tmp_path, 9, state(1.0))
+    save_checkpoint(tmp_path, 19, state(2.0))
+    assert [path.name for path in tmp_path.iterdir()] == ["step-000000019.ckpt"]
+    loaded = load_checkpoint(latest_checkpoint(tmp_path), "d")
+    assert torch.equal(loaded["model"]["w"], torch.full((50, 50), 2.0))
+
+
+def test_the_latest_is_by_number_not_by_name_or_time(tmp_path: Path):
+    for step in (999, 5):
+        (tmp_path / f"step-{step:09d}.ckpt").write_bytes(b"")
+    (tmp_path / "step-1000000000.ckpt").write_bytes(b"")
+    (tmp_path / ".step-9999999999.ckpt.tmp").write_bytes(b"")
+    assert latest_checkpoint(tmp_path).name == "step-1000000000.ckpt"
+
+
+@pytest.mark.parametrize("position", [0, 30, 84, 85, 200, -1])
+def test_one_flipped_byte_is_refused(tmp_path: Path, position: int):
+    path = save_checkpoint(tmp_path, 1, state(1.0))
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"step-000000001\.ckpt: (truncated or changed|not a checkpoint)"):
+        load_checkpoint(path, "d")
+
+
+@pytest.mark.parametrize("kept", [0, 10, 84, 1000])
+def test_truncated_is_refused(tmp_path: Path, kept: int):
+    path = save_checkpoint(tmp_path, 1, state(1.0))
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(InputError, match=r"truncated|not a checkpoint"):
+        load_checkpoint(path, "d")
+
+
+def test_another_configuration_is_refused(tmp_path: Path):
+    path = save_checkpoint(tmp_path, 1, state(1.0))
+    with pytest.raises(InputError, match="another configuration"):
+        load_checkpoint(path, "e")
+
+
+class Bomb:
+    def __reduce__(self):
+        return os.mkdir, ("exploded",)
+
+
+@pytest.mark.parametrize("how", ["pickle", "torch"])
+def test_a_pickle_is_refused_and_never_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str):
+    monkeypatch.chdir(tmp_path)
+    payload_path = tmp_path / "payload"
+    if how == "torch":
+        torch.save({"config_digest": "d", "model": Bomb()}, payload_path)
+    else:
+        payload_path.write_bytes(pickle.dumps(Bomb()))
+    payload = payload_path.read_bytes()
+    path = tmp_path / "step-000000001.ckpt"
+    path.write_bytes(MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
+    with pytest.raises(InputError, match="pickle"):
+        load_checkpoint(path, "d")
+    assert not (tmp_path / "exploded").exists()
+
+
+FULL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+import torch
+from edge_se_sampler.engine.checkpoint import save_checkpoint
+from edge_se_sampler.errors import InputError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+try:
+    save_checkpoint(Path(sys.argv[1]), 2, {"step": 2, "config_digest": "d", "w": torch.zeros(100_000)})
+except InputError as problem:
+    print(problem)
+"""
+
+
+def test_a_disk_that_fills_up_leaves_the_old_checkpoint(tmp_path: Path):
+    save_checkpoint(tmp_path, 1, state(1.0))
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path)]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "step-000000002.ckpt: cannot be written" in said
+    assert said.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["step-000000001.ckpt"]
+    assert load_checkpoint(latest_checkpoint(tmp_path), "d")["model"]["w"][0, 0] == 1
+
+
+SAVE_FOREVER = """
+import sys
+from pathlib import Path
+import torch
+from edge_se_sampler.engine.checkpoint import save_checkpoint
+step = 0
+while True:
+    step += 1
+    save_checkpoint(Path(sys.argv[1]), step, {"step": step, "config_digest": "d", "w": torch.rand(1_000_000)})
+    print(step, flush=True)
+"""
+
+
+def test_killed_at_random_moments_a_checkpoint_loads(tmp_path: Path):
+    moments = random.Random(0)
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", SAVE_FOREVER, str(tmp_path)], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()  # one is certainly there
+        time.sleep(moments.uniform(0, 0.1))
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        assert load_checkpoint(latest_checkpoint(tmp_path), "d")["w"].shape == (1_000_000,)
+
+
+def test_atomic_writing_replaces_whole_files_only(tmp_path: Path):
+    path = tmp_path / "a.json"
+    write_atomically(path, b"old")
+    with pytest.raises(InputError, match="untouched"):
+        write_atomically(tmp_path / "missing" / "a.json", b"new")
+    write_atomically(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]

@@ -1,0 +1,109 @@
+"""The commands on good input: what they leave behind is what they promise."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from conftest import SMALL
+
+from edge_se_sampler.cli import COMMANDS
+from edge_se_sampler.methods import STRATEGIES
+
+
+def test_a_run_folder(run: Path):
+    assert {path.name for path in run.iterdir()} == {"config.json", "metrics.jsonl", "checkpoints", "previews"}
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["step-000000005.ckpt"]
+    config = json.loads((run / "config.json").read_text())
+    assert config["method_name"] == "edge-se-nerf"
+    assert config["pipeline"]["model"]["size"] == "tiny"
+    assert None not in config["pipeline"]["model"].values()  # nothing left open: the run says what it is
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "loss" in line] == [0, 5]
+    assert [line["strategy"] for line in lines if "loss" in line] == ["edge", "se"]
+    assert len([line for line in lines if "val_psnr" in line]) == 6
+    assert iio.imread(run / "previews" / "step-000000005.png").shape == (24, 24, 3)
+
+
+def test_eval_writes_valid_json_with_the_hosts_keys(run: Path, tmp_path: Path, edge_se):
+    answer = edge_se("eval", run, "--output-path", tmp_path / "eval.json", "--render-output-path", tmp_path / "views")
+    assert answer.code == 0
+    text = (tmp_path / "eval.json").read_text()
+    content = json.loads(text, parse_constant=lambda token: pytest.fail(f"{token} is no json"))
+    assert set(content) == {"experiment_name", "method_name", "checkpoint", "results"}
+    results = content["results"]
+    assert f"PSNR {results['psnr']:.2f} dB over 1 views" in answer.out
+    assert results["lpips"] is None
+    pair = iio.imread(tmp_path / "views" / "0000.png").astype(float) / 255
+    truth, rendered = pair[:, :24], pair[:, 24:]
+    assert -10 * np.log10(((truth - rendered) ** 2).mean()) == pytest.approx(results["psnr"], abs=0.1)
+
+
+def test_render_gif(run: Path, tmp_path: Path, edge_se):
+    path = tmp_path / "turn.gif"
+    assert edge_se("render", run, "--output-path", path, "--num-frames", 3).code == 0
+    assert iio.imread(path).shape[:3] == (3, 24, 24)
+
+
+def test_show_and_methods(scene: Path, tmp_path: Path, edge_se):
+    pytest.importorskip("matplotlib")
+    assert edge_se("show", "--data", scene, "--output-path", tmp_path / "show.png", "--num-views", 2).code == 0
+    assert iio.imread(tmp_path / "show.png").std() > 10
+    listed = edge_se("methods").out
+    assert [line.split()[0] for line in listed.splitlines()][: len(STRATEGIES)] == list(STRATEGIES)
+
+
+def test_a_time_limit_only_stops(scene: Path, tmp_path: Path, edge_se):
+    flags = [*SMALL, "--max-num-iterations", 400, "--max-seconds", 0.3, "--output-dir", tmp_path / "o"]
+    answer = edge_se("train", "edge-nerf", "--data", scene, *flags)
+    assert answer.code == 0
+    assert "edge-se resume" in answer.out
+    lines = (next(tmp_path.glob("o/*/*/*")) / "metrics.jsonl").read_text().splitlines()
+    last = [json.loads(line) for line in lines][-1]
+    assert last["step"] < 200
+    rate = json.loads(lines[0])["learning_rate"]
+    step = [json.loads(line) for line in lines if "loss" in line][-1]
+    assert step["learning_rate"] == pytest.approx(rate * 0.1 ** (step["step"] / 400))
+
+
+def test_nothing_existing_is_overwritten(scene: Path, tmp_path: Path, edge_se):
+    for _ in range(3):  # within one second
+        assert edge_se("train", "edge-nerf", "--data", scene, "--output-dir", tmp_path / "o", *SMALL).code == 0
+    assert len(list(tmp_path.glob("o/scene/edge-nerf/*/config.json"))) == 3
+
+
+def test_a_made_folder_trains_without_held_out_views(scene: Path, tmp_path: Path, edge_se):
+    for split in ("val", "test"):
+        (scene / f"transforms_{split}.json").unlink()
+    assert edge_se("train", "se-nerf", "--data", scene, "--output-dir", tmp_path / "o", *SMALL).code == 0
+    run = next(tmp_path.glob("o/*/*/*"))
+    answer = edge_se("eval", run, "--output-path", tmp_path / "e.json")
+    assert answer.code == 2
+    assert "transforms_test.json" in answer.err
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "train edge-se-nerf"])
+def test_help_is_complete_and_comes_without_torch(command: str):
+    script = (
+        "import sys; from edge_se_sampler.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit as end: code = end.code\n"
+        "assert not code and 'torch' not in sys.modules, (code, 'torch' in sys.modules)"
+    )
+    began = time.monotonic()
+    arguments = [sys.executable, "-c", script, *command.split(), "--help"]
+    environment = os.environ | {"COLUMNS": "200"}
+    told = subprocess.run(arguments, check=True, capture_output=True, text=True, env=environment).stdout
+    assert time.monotonic() - began < 10  # the bar is 1.5 s; this only catches a heavy import on a busy machine
+    flags = told.count("--")
+    if command == "train edge-se-nerf":
+        assert "--pipeline.datamanager.pixel-sampler.early {uniform,precrop,edge}" in told
+        assert flags > 35
+    assert "usage: edge-se" in told

@@ -1,0 +1,177 @@
+"""Bad input at the command line: exit code 2, one line on stderr that says what and where, nothing written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import SMALL
+
+from edge_se_sampler.engine.trainer import Trainer
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def refused(edge_se: Callable, folder: Path, *arguments: object) -> str:
+    """The one line of a refusal that leaves the folder as it was."""
+    before = files(folder)
+    answer = edge_se(*arguments)
+    assert answer.code == 2, answer
+    assert answer.err.startswith("edge-se: ")
+    assert answer.err.count("\n") == 1, answer.err
+    assert "Traceback" not in answer.err
+    assert answer.out == ""
+    assert files(folder) == before
+    return answer.err
+
+
+def spoil(scene: Path, change: Callable[[dict], None]) -> None:
+    path = scene / "transforms_train.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+DATA = {
+    "angle": (lambda scene: spoil(scene, lambda c: c.update(camera_angle_x="wide")), "camera_angle_x"),
+    "no frames": (lambda scene: spoil(scene, lambda c: c.update(frames=[])), "frames"),
+    "broken json": (
+        lambda scene: (scene / "transforms_train.json").write_text('{"frames": ['),
+        "transforms_train.json",
+    ),
+    "missing file": (lambda scene: (scene / "transforms_train.json").unlink(), "transforms_train.json"),
+    "missing image": (lambda scene: (scene / "train" / "r_1.png").unlink(), "r_1"),
+    "truncated image": (
+        lambda scene: (scene / "train" / "r_1.png").write_bytes((scene / "train" / "r_1.png").read_bytes()[:300]),
+        "r_1.png",
+    ),
+    "leaving path": (lambda scene: spoil(scene, lambda c: c["frames"][2].update(file_path="../r_0")), "frames[2]"),
+    "bad pose": (lambda scene: spoil(scene, lambda c: c["frames"][1].update(transform_matrix=[[1]])), "frames[1]"),
+}
+
+
+@pytest.mark.parametrize("case", DATA)
+def test_train_on_bad_data(case: str, scene: Path, tmp_path: Path, edge_se):
+    break_it, named = DATA[case]
+    break_it(scene)
+    arguments = ("train", "edge-nerf", "--data", scene, "--output-dir", tmp_path / "o", *SMALL)
+    assert named in refused(edge_se, tmp_path, *arguments)
+
+
+def test_all_pixels_masked(scene: Path, tmp_path: Path, edge_se):
+    import imageio.v3 as iio
+    import numpy as np
+
+    iio.imwrite(scene / "mask.png", np.zeros((24, 24), np.uint8))
+    spoil(scene, lambda c: [frame.update(mask_path="mask.png") for frame in c["frames"]])
+    arguments = ("train", "edge-nerf", "--data", scene, "--output-dir", tmp_path / "o", *SMALL)
+    assert "mask" in refused(edge_se, tmp_path, *arguments)
+
+
+SETTINGS = [
+    (["--pipeline.datamanager.pixel-sampler.erly", "edge"], "pixel-sampler.early"),
+    (["--pipeline.datamanager.pixel-sampler.early", "edgy"], "'uniform', 'precrop', 'edge'"),
+    (["--pipeline.datamanager.pixel-sampler.early-fraction", "1.5"], "early-fraction"),
+    (["--pipeline.datamanager.pixel-sampler.early-steps", "9"], "schedule"),
+    (["--pipeline.datamanager.pixel-sampler.edge-epsilon", "0"], "edge-epsilon"),
+    (["--max-num-iterations", "many"], "--max-num-iterations"),
+    (["--max-num-iterations", "0"], "--max-num-iterations"),
+    (["--max-seconds", "nan"], "--max-seconds"),
+    (["--optimizer.lr", "-1"], "--optimizer.lr"),
+    (["--pipeline.model.near", "7"], "near"),
+    (["--pipeline.model.depth", "0"], "depth"),
+    (["--experiment-name", "../up"], "--experiment-name"),
+    (["--machine.device-type", "cuda"], "cuda"),
+]
+
+
+@pytest.mark.parametrize(("flags", "named"), SETTINGS, ids=[" ".join(flags) for flags, _ in SETTINGS])
+def test_settings_that_do_not_exist_or_have_no_meaning(flags, named: str, scene: Path, tmp_path: Path, edge_se):
+    import torch
+
+    if "cuda" in flags and torch.cuda.is_available():
+        pytest.skip("there is a GPU here")
+    line = refused(edge_se, tmp_path, "train", "edge-nerf", "--data", scene, "--output-dir", tmp_path / "o", *flags)
+    assert named in line
+
+
+def test_unknown_names_suggest_the_nearest(tmp_path: Path, edge_se):
+    assert "'train'" in refused(edge_se, tmp_path, "trian")
+    assert "'edge-se-nerf'" in refused(edge_se, tmp_path, "train", "edge-se-nref")
+    assert "demo" in refused(edge_se, tmp_path)
+    assert "--data" in refused(edge_se, tmp_path, "train", "edge-nerf")
+    assert "--out" in refused(edge_se, tmp_path, "scenes")
+    assert "mic" in refused(edge_se, tmp_path, "scenes", "--out", tmp_path / "s", "--names", "mike")
+
+
+def test_an_output_folder_that_cannot_be_written(scene: Path, tmp_path: Path, edge_se):
+    (tmp_path / "file").write_text("in the way")
+    line = refused(edge_se, tmp_path, "train", "edge-nerf", "--data", scene, "--output-dir", tmp_path / "file", *SMALL)
+    assert "--output-dir" in line
+
+
+class TestRuns:
+    def test_no_run(self, tmp_path: Path, edge_se):
+        for command in ("eval", "render", "resume"):
+            assert "no such run folder" in refused(edge_se, tmp_path, command, tmp_path / "nowhere")
+            assert "config.json" in refused(edge_se, tmp_path, command, tmp_path)
+
+    def test_without_checkpoint(self, run: Path, edge_se):
+        next((run / "checkpoints").iterdir()).unlink()
+        for command in ("eval", "resume"):
+            assert "no checkpoint" in refused(edge_se, run, command, run)
+
+    def test_with_a_flipped_byte(self, run: Path, edge_se):
+        path = next((run / "checkpoints").iterdir())
+        content = bytearray(path.read_bytes())
+        content[5000] ^= 8
+        path.write_bytes(content)
+        for command in ("eval", "resume", "render"):
+            assert path.name in refused(edge_se, run, command, run)
+
+    def test_with_another_configuration(self, run: Path, edge_se):
+        config = json.loads((run / "config.json").read_text())
+        config["pipeline"]["model"]["width"] = 32
+        (run / "config.json").write_text(json.dumps(config))
+        assert "another configuration" in refused(edge_se, run, "eval", run)
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (lambda c: c.pop("optimizer"), "optimizer"),
+            (lambda c: c.update(surprise=1), "surprise"),
+            (lambda c: c.update(method_name="gone"), "method_name"),
+            (lambda c: c["pipeline"].update(model=3), "model"),
+        ],
+    )
+    def test_with_a_config_of_another_version(self, run: Path, edge_se, change, named: str):
+        config = json.loads((run / "config.json").read_text())
+        change(config)
+        (run / "config.json").write_text(json.dumps(config))
+        assert named in refused(edge_se, run, "eval", run)
+
+    def test_with_data_that_is_gone(self, run: Path, scene: Path, edge_se):
+        scene.rename(scene.with_name("moved"))
+        assert "scene" in refused(edge_se, run, "eval", run)
+
+    def test_outputs_that_cannot_be(self, run: Path, tmp_path: Path, edge_se):
+        assert "--output-path" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "no" / "e.json")
+        assert ".gif or .mp4" in refused(edge_se, run, "render", run, "--output-path", tmp_path / "x.avi")
+        assert "--num-frames" in refused(edge_se, run, "render", run, "--num-frames", 0)
+
+
+@pytest.mark.parametrize("previews", [1, 100])
+def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
+    previews: int, scene: Path, tmp_path: Path, edge_se, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Trainer, "learning_rate", lambda self, step: 1e-3 if step < 3 else 1e38)
+    flags = ["--steps-per-eval-image", previews, "--steps-per-save", 1, "--output-dir", tmp_path / "o"]
+    answer = edge_se("train", "vanilla-nerf", "--data", scene, *SMALL, *flags)
+    assert answer.code == 1
+    assert "not finite" in answer.err
+    assert answer.err.count("\n") == 1
+    assert [path.name for path in tmp_path.glob("o/*/*/*/checkpoints/*")] == ["step-000000002.ckpt"]

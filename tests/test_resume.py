@@ -1,0 +1,120 @@
+"""An interrupted and resumed run equals the uninterrupted one bit for bit, each part in a process of its own."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from edge_se_sampler.engine.checkpoint import latest_checkpoint
+
+SESSION = """
+import hashlib, json, os, signal, sys
+from dataclasses import replace
+from pathlib import Path
+from edge_se_sampler.engine.config import MachineConfig
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import prepare, prepare_resume
+from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
+
+what, place, data, interrupt_at = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])
+if what == "resume":
+    trainer = prepare_resume(RunFolder(place))
+else:
+    config = registered_methods()["edge-se-nerf"].specification.config
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.7)
+    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
+    model = replace(config.pipeline.model, num_coarse_samples=8, num_importance_samples=8, density_noise=0.1)
+    trainer = prepare(replace(
+        config, data=data, output_dir=place, max_num_iterations=20, steps_per_log=3, steps_per_eval_image=5,
+        machine=MachineConfig(seed=3, device_type="cpu"),
+        pipeline=replace(config.pipeline, datamanager=manager, model=model),
+    ))
+
+def interrupt(step):
+    if step == interrupt_at:
+        os.kill(os.getpid(), signal.SIGINT)
+
+trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], interrupt))
+pixels = []
+draw = trainer.pipeline.datamanager.next_train
+def recorded(step):
+    rays, batch = draw(step)
+    pixels.append([step, hashlib.sha256(batch["indices"].numpy().tobytes()).hexdigest()])
+    return rays, batch
+trainer.pipeline.datamanager.next_train = recorded
+trainer.train()
+print(json.dumps({"run": str(trainer.run.path), "pixels": pixels}))
+"""
+
+
+def session(what: str, place: Path, scene: Path, interrupt_at: int = -1) -> dict:
+    command = [sys.executable, "-c", SESSION, what, str(place), str(scene), str(interrupt_at)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def metrics(run: Path) -> list[dict]:
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
+
+
+def state(run: Path) -> dict[str, bytes | float | str]:
+    """Everything in the last checkpoint, flat, tensors as bytes; the time aside."""
+    content = latest_checkpoint(run / "checkpoints").read_bytes().partition(b"\n")[2]
+    flat: dict[str, bytes | float | str] = {}
+
+    def flatten(name: str, value: Any) -> None:
+        if isinstance(value, dict | list | tuple):
+            for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+                flatten(f"{name}.{key}", item)
+        else:
+            flat[name] = value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
+
+    flatten("", torch.load(io.BytesIO(content), weights_only=True))
+    del flat[".elapsed"]
+    return flat
+
+
+@pytest.mark.parametrize("interrupt_at", [8, pytest.param(16, marks=pytest.mark.slow)])  # in the edge, in the SE phase
+def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, interrupt_at: int):
+    whole = session("train", tmp_path / "whole", scene)
+    first = session("train", tmp_path / "parts", scene, interrupt_at)
+    run = Path(first["run"])
+    assert [step for step, _ in first["pixels"]] == list(range(interrupt_at + 1))
+    assert latest_checkpoint(run / "checkpoints").name == f"step-{interrupt_at:09d}.ckpt"
+    # what a kill may leave behind: metrics beyond the checkpoint, a line cut short
+    with open(run / "metrics.jsonl", "a") as file:
+        file.write('{"step": 19, "loss": 1.0}\n{"step": 1')
+    second = session("resume", run, scene)
+    assert first["pixels"] + second["pixels"] == whole["pixels"]
+    assert metrics(run) == metrics(Path(whole["run"]))
+    assert state(run) == state(Path(whole["run"]))
+    assert any(isinstance(value, bytes) for value in state(run).values())
+
+
+def test_ctrl_c_saves_and_says_one_line(tmp_path: Path, scene: Path):
+    command = [
+        sys.executable, "-m", "edge_se_sampler.cli", "train", "vanilla-nerf", "--data", str(scene),
+        "--output-dir", str(tmp_path / "o"), "--pipeline.datamanager.train-num-rays-per-batch", "16",
+    ]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("o/*/*/*/metrics.jsonl")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err.count("\n") == 1
+    assert "saved" in err
+    assert "edge-se resume" in err
+    run = next(tmp_path.glob("o/*/*/*"))
+    assert latest_checkpoint(run / "checkpoints")

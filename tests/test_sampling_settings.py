@@ -1,0 +1,69 @@
+"""Values and combinations of settings that have no meaning are refused, in a sentence that names the flag."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig, SamplingSettings
+
+NAN, INF = float("nan"), float("inf")
+
+REFUSED: list[tuple[str, dict[str, Any]]] = [
+    *[("precrop-fraction", {"precrop_fraction": value}) for value in (0, -0.5, 1.01, NAN)],
+    *[("early-fraction", {"early_fraction": value}) for value in (-0.01, 1.01, NAN)],
+    *[("early-steps", {"schedule": "steps", "early_steps": value}) for value in (0, -1)],
+    ("early-steps", {"early_steps": 100}),  # schedule "fraction"
+    *[("edge-epsilon", {"edge_epsilon": value}) for value in (0, -1e-3, INF, NAN)],
+    *[("se-candidates", {"se_candidates": value}) for value in (1, 0, -2)],
+    *[("importance-weight", {"importance_weight": value}) for value in (-0.1, 1.1, NAN)],
+    ("importance-weight", {"importance_weight": 0.5, "early": "uniform", "late": "uniform"}),
+]
+
+
+@pytest.mark.parametrize(("flag", "settings"), REFUSED)
+def test_refused(flag: str, settings: dict[str, Any]) -> None:
+    message = rf"^pixel-sampler\.{flag} is {re.escape(repr(settings[flag.replace('-', '_')]))}: \w.*$"
+    with pytest.raises(InputError, match=message) as refusal:
+        SamplingSettings(**settings).check()
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(("flag", "settings"), REFUSED)
+def test_a_sampler_refuses_them_when_it_is_made(flag: str, settings: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=flag):
+        EdgeSEPixelSamplerConfig(**settings).setup()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"precrop_fraction": 1},
+        {"precrop_fraction": 1e-6},
+        {"early_fraction": 0},
+        {"early_fraction": 1},
+        {"schedule": "steps", "early_steps": 1},
+        {"edge_epsilon": 1e-30},
+        {"se_candidates": 2},
+        {"importance_weight": 1.0},
+        {"importance_weight": 0.5, "early": "uniform"},
+        {"importance_weight": 0.5, "late": "uniform"},
+        {"early": "uniform", "late": "uniform"},
+    ],
+)
+def test_accepted_to_the_very_limits(settings: dict[str, Any]) -> None:
+    made = SamplingSettings(**settings)
+    made.check()
+    assert made == SamplingSettings(**settings)
+
+
+def test_defaults_are_the_papers_edge_and_squared_error() -> None:
+    config = EdgeSEPixelSamplerConfig()
+    assert (config.early, config.late, config.schedule, config.early_fraction) == ("edge", "se", "fraction", 0.1)
+    assert (config.precrop_fraction, config.edge_filter, config.edge_source) == (0.5, "sobel", "color")
+    assert (config.edge_epsilon, config.se_candidates, config.importance_weight) == (0.01, 2, 0.0)
+    assert (config.images_per_step, config.num_rays_per_batch) == ("one", 1024)

@@ -1,0 +1,49 @@
+"""Which phase a step is in."""
+
+from __future__ import annotations
+
+import pytest
+
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig, SamplingSettings
+from edge_se_sampler.schedule import phase_at
+
+
+@pytest.mark.parametrize(
+    ("step", "early_steps", "phase"),
+    [
+        (0, 0, "late"),
+        (0, 1, "early"),
+        (1, 1, "late"),
+        (99, 100, "early"),
+        (100, 100, "late"),
+        (0, 0.5, "early"),  # a tenth of 5 steps
+        (1, 0.5, "late"),
+        (2, 2.5, "early"),
+        (3, 2.5, "late"),
+    ],
+)
+def test_early_while_the_step_is_below_the_length(step: int, early_steps: float, phase: str) -> None:
+    assert phase_at(step, early_steps) == phase
+
+
+@pytest.mark.parametrize("planned", [1, 9, 10, 11, 70, 230, 1000, 15_000, 200_000, 300_007])
+def test_the_papers_tenth_is_exact(planned: int) -> None:
+    length = SamplingSettings().early_length(planned)
+    tenth = -(-planned // 10)  # step < planned / 10 holds for this many steps
+    around = range(max(tenth - 2, 0), tenth + 3)
+    assert [phase_at(step, length) == "early" for step in around] == [step < tenth for step in around]
+
+
+@pytest.mark.parametrize(
+    ("settings", "length"),
+    [
+        ({"early_fraction": 0.0}, 0),
+        ({"early_fraction": 0.25}, 250),
+        ({"early_fraction": 1.0}, 1000),
+        ({"schedule": "steps", "early_steps": 17}, 17),
+        ({"schedule": "steps", "early_steps": 17, "early_fraction": 0.5}, 17),
+        ({"schedule": "steps", "early_steps": 5000}, 5000),
+    ],
+)
+def test_length_of_the_early_phase(settings: dict, length: float) -> None:
+    assert EdgeSEPixelSamplerConfig(**settings).early_length(1000) == length
