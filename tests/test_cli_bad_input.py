@@ -168,7 +168,7 @@ class TestRuns:
 def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
     previews: int, scene: Path, tmp_path: Path, edge_se, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(Trainer, "learning_rate", lambda self, step: 1e-3 if step < 3 else 1e38)
+    monkeypatch.setattr(Trainer, "learning_rate", lambda self, step: 1e-3 if step < 3 else float("inf"))
     flags = ["--steps-per-eval-image", previews, "--steps-per-save", 1, "--output-dir", tmp_path / "o"]
     answer = edge_se("train", "vanilla-nerf", "--data", scene, *SMALL, *flags)
     assert answer.code == 1

@@ -1,0 +1,68 @@
+"""A tiny NeRF, rays through its sampled shell, and views of random pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.nerf.config import NeRFModelConfig
+from edge_se_sampler.nerf.model import NeRFModel
+
+
+def tiny_config(**changes: Any) -> NeRFModelConfig:
+    """A resolved config of a network that is evaluated in no time."""
+    small = NeRFModelConfig(
+        size="tiny",
+        width=8,
+        depth=3,
+        position_frequencies=2,
+        direction_frequencies=1,
+        num_coarse_samples=6,
+        num_importance_samples=5,
+    )
+    return replace(small, **changes)
+
+
+def tiny_model(seed: int = 0, **changes: Any) -> NeRFModel:
+    """It, in float64."""
+    return NeRFModel(tiny_config(**changes), np.random.default_rng(seed)).double()
+
+
+def tiny_rays(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> RayBundle:
+    """Rays from 4 world units away, past the origin within 1; directions_norm between 1 and 1.2."""
+    rng = np.random.default_rng(seed)
+    origins = rng.normal(size=(count, 3))
+    origins *= 4 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.uniform(-0.6, 0.6, (count, 3)) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    norm = torch.from_numpy(rng.uniform(1, 1.2, (count, 1))).to(dtype)
+    numbers = torch.zeros((count, 1), dtype=torch.int64)
+    return RayBundle(
+        torch.from_numpy(origins).to(dtype), torch.from_numpy(directions).to(dtype), numbers, {"directions_norm": norm}
+    )
+
+
+def with_constant_density(model: NeRFModel, raw: float) -> NeRFModel:
+    """The model with this raw density everywhere, in both networks."""
+    with torch.no_grad():
+        for field in (model.coarse, model.fine):
+            field.density.weight.zero_()
+            field.density.bias.fill_(raw)
+    return model
+
+
+def tiny_views(
+    count: int = 3, height: int = 8, width: int = 6, channels: int = 4, masks: tuple[np.ndarray, ...] | None = None
+) -> Views:
+    """Views of random pixels, from 4 world units away along their own z axis."""
+    rng = np.random.default_rng(5)
+    images = tuple(rng.integers(0, 256, (height, width, channels), dtype=np.uint8) for _ in range(count))
+    poses = np.concatenate((np.eye(3), [[0], [0], [4]]), axis=1)
+    lens = np.tile([7.0, 8.0], (count, 1))
+    middle = np.tile([width / 2, height / 2], (count, 1))
+    return Views(tuple(f"view {i}" for i in range(count)), images, masks, np.tile(poses, (count, 1, 1)), lens, middle)
