@@ -185,10 +185,13 @@ class Methods:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure: edge-se bench samplers times tables and draws."""
+    """Measure: edge-se bench samplers, edge-se bench quality."""
 
-    what: Annotated[Literal["samplers"], tyro.conf.Positional]
-    """samplers: building tables, drawing, selecting, and the memory of SE."""
+
+@dataclass(frozen=True)
+class BenchSamplers:
+    """Time building tables, drawing and selecting pixels; compare the memory of SE with Random's."""
+
     output_path: Path | None = None
     """A json to write besides printing."""
     images: int = 100
@@ -212,6 +215,32 @@ class Bench:
             write_json(self.output_path, result)
 
 
+@dataclass(frozen=True)
+class BenchQuality:
+    """Train a method on a made scene for some minutes; leave result.json and curve.png."""
+
+    output_dir: Path
+    """Where the result goes."""
+    workplace: Path = Path("bench")
+    """Where the scene and the run are kept."""
+    method: str = "edge-se-nerf"
+    """One of edge-se methods."""
+    scene: str = "bricks"
+    """One of edge-se scenes."""
+    seconds: float = 180
+    """Of training at most."""
+    seed: int = 0
+    """Of weights, pixels and jitter."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.quality import bench_quality
+
+        if self.method not in registered_methods():
+            raise InputError(f"--method {self.method!r} is not registered; see edge-se methods")
+        result = bench_quality(self.output_dir, self.workplace, self.method, self.scene, self.seconds, self.seed)
+        print(f"{result['results']['psnr']:.2f} dB after {result['seconds']:.0f} s; see {self.output_dir}")
+
+
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "scenes": Scenes,
@@ -223,6 +252,7 @@ COMMANDS: dict[str, type] = {
     "methods": Methods,
     "bench": Bench,
 }
+BENCHES: dict[str, type] = {"samplers": BenchSamplers, "quality": BenchQuality}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -257,9 +287,16 @@ def _run(arguments: list[str]) -> None:
         from edge_se_sampler.engine.session import prepare
 
         _train(prepare(config))
+    elif arguments[:1] == ["bench"]:
+        _parse(_one_of(BENCHES), arguments[1:], "edge-se bench", list(BENCHES)).run()
     else:
-        kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items())  # type: ignore[valid-type]
-        _parse(Union[kinds], arguments, "edge-se", list(COMMANDS)).run()  # noqa: UP007
+        _parse(_one_of(COMMANDS), arguments, "edge-se", list(COMMANDS)).run()
+
+
+def _one_of(commands: dict[str, type]) -> Any:
+    """The type that tyro parses into one of the commands."""
+    kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items())  # type: ignore[valid-type]
+    return Union[kinds]  # noqa: UP007
 
 
 def _parse(kind: Any, arguments: list[str], program: str, names: list[str]) -> Any:

@@ -106,6 +106,16 @@ class ImportantPixels:
         inside[top : top + height, left : left + width] = 1
         return inside
 
+    def check_images(self, image_batch: dict[str, Any]) -> None:
+        """Refuse images that a phase could draw nothing from, before training; its tables are built by that.
+
+        Raises:
+            InputError: as `sample`.
+        """
+        batch = ImageBatch.of(image_batch, use_mask=not self.config.ignore_mask)
+        for strategy in {self.config.early, "uniform"}:
+            self._drawable(batch, strategy)
+
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
 
@@ -157,10 +167,7 @@ class ImportantPixels:
     def _draw(self, batch: ImageBatch, strategy: str, count: int) -> tuple[Tensor, Tensor | None]:
         """Pixels (count, 3): position in the batch, row, column; and their loss weights, if any are asked for."""
         rng = stream(self._seed, self._step, Stream.PIXELS)
-        source, places = self.distribution(batch, strategy)
-        drawable = torch.nonzero(source.drawable(places))[:, 0]
-        if not len(drawable):
-            raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
+        source, places, drawable = self._drawable(batch, strategy)
         if self.config.images_per_step == "one":
             drawable = drawable[rng.integers(len(drawable), size=1)]
         drawn = source.draw(places[drawable], count, rng)
@@ -170,6 +177,14 @@ class ImportantPixels:
             weight = (relative**-self.config.importance_weight).float().to(batch.device)
         drawn[:, 0] = drawable[drawn[:, 0]]
         return drawn, weight
+
+    def _drawable(self, batch: ImageBatch, strategy: str) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
+        """What a strategy draws from, the images' places in it, and the positions that have a pixel to draw."""
+        source, places = self.distribution(batch, strategy)
+        drawable = torch.nonzero(source.drawable(places))[:, 0]
+        if not len(drawable):
+            raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
+        return source, places, drawable
 
     def _candidates(self, batch: ImageBatch, count: int) -> dict[str, Any]:
         """Score uniform candidates and keep `count` of them by rank."""

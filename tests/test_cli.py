@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -14,12 +15,14 @@ import numpy as np
 import pytest
 from conftest import SMALL
 
-from edge_se_sampler.cli import COMMANDS
+from edge_se_sampler.cli import BENCHES, COMMANDS
 from edge_se_sampler.methods import STRATEGIES
 
 
 def test_a_run_folder(run: Path):
-    assert {path.name for path in run.iterdir()} == {"config.json", "metrics.jsonl", "checkpoints", "previews"}
+    names = {path.name.split(".tfevents")[0] for path in run.iterdir()}
+    events = {"events.out"} if find_spec("tensorboard") else set()
+    assert names == {"config.json", "metrics.jsonl", "checkpoints", "previews"} | events
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["step-000000005.ckpt"]
     config = json.loads((run / "config.json").read_text())
     assert config["method_name"] == "edge-se-nerf"
@@ -89,7 +92,7 @@ def test_a_made_folder_trains_without_held_out_views(scene: Path, tmp_path: Path
     assert "transforms_test.json" in answer.err
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, "train edge-se-nerf"])
+@pytest.mark.parametrize("command", [*COMMANDS, *(f"bench {name}" for name in BENCHES), "train edge-se-nerf"])
 def test_help_is_complete_and_comes_without_torch(command: str):
     script = (
         "import sys; from edge_se_sampler.cli import main\n"

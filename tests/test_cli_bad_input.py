@@ -6,6 +6,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 from conftest import SMALL
 
@@ -63,13 +65,27 @@ def test_train_on_bad_data(case: str, scene: Path, tmp_path: Path, edge_se):
 
 
 def test_all_pixels_masked(scene: Path, tmp_path: Path, edge_se):
-    import imageio.v3 as iio
-    import numpy as np
-
     iio.imwrite(scene / "mask.png", np.zeros((24, 24), np.uint8))
     spoil(scene, lambda c: [frame.update(mask_path="mask.png") for frame in c["frames"]])
     arguments = ("train", "edge-nerf", "--data", scene, "--output-dir", tmp_path / "o", *SMALL)
     assert "mask" in refused(edge_se, tmp_path, *arguments)
+
+
+def test_alpha_edges_of_images_without_alpha(scene: Path, tmp_path: Path, edge_se):
+    for path in (scene / "train").iterdir():
+        iio.imwrite(path, iio.imread(path)[..., :3])
+    flags = ["--pipeline.datamanager.pixel-sampler.edge-source", "alpha", "--output-dir", tmp_path / "o", *SMALL]
+    assert "alpha" in refused(edge_se, tmp_path, "train", "edge-nerf", "--data", scene, *flags)
+
+
+def test_nothing_left_in_the_crop(scene: Path, tmp_path: Path, edge_se):
+    mask = np.full((24, 24), 255, np.uint8)
+    mask[4:20, 4:20] = 0
+    iio.imwrite(scene / "mask.png", mask)
+    spoil(scene, lambda c: [frame.update(mask_path="mask.png") for frame in c["frames"]])
+    arguments = ("--data", scene, "--output-dir", tmp_path / "o", *SMALL)
+    assert "'precrop'" in refused(edge_se, tmp_path, "train", "precrop-nerf", *arguments)
+    assert edge_se("train", "edge-nerf", *arguments).code == 0
 
 
 SETTINGS = [

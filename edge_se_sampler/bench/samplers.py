@@ -20,6 +20,7 @@ from edge_se_sampler.bench.machine import machine, peak_memory
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.distribution import PixelTable, UniformPixels
 from edge_se_sampler.edges import edge_strength
+from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
@@ -149,7 +150,8 @@ def training_peak(method: str, rays: str) -> int:
     model = replace(config.pipeline.model, size="small")
     config = planned(replace(config, pipeline=replace(config.pipeline, datamanager=manager, model=model)), views)
     before = peak_memory()
-    trainer = config.setup(run=RunFolder(Path("never-written")), views=views, preview=None, device="cpu")
+    pipeline = Pipeline.build(config, views, "cpu")
+    trainer = config.setup(run=RunFolder(Path("never-written")), pipeline=pipeline, preview=None)
     for step in range(3):
         trainer.train_iteration(step)
     return peak_memory() - before

@@ -14,6 +14,7 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.datamanager import SamplerHooks
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.pixel_sampler import ImportantPixels
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
 
@@ -43,11 +44,14 @@ class DataManager:
         self.train_pixel_sampler = copy.copy(config.pixel_sampler).setup(
             num_rays_per_batch=config.train_num_rays_per_batch, background_color=background_color
         )
+        if isinstance(self.train_pixel_sampler, ImportantPixels):
+            self.train_pixel_sampler.check_images(self.image_batch)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """The rays of a training step and their pixels: "image" (N, 3|4) in [0, 1], "indices" (N, 3), ..."""
         batch = self.train_pixel_sampler.sample(self.image_batch)
-        batch["image"] = unit_interval(batch["image"]).to(self.device)
+        batch["image"] = unit_interval(batch["image"])
+        batch = {key: value.to(self.device) for key, value in batch.items() if key != "full_image"}
         return self.train_ray_generator(batch["indices"]), batch
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:

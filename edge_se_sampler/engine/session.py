@@ -12,7 +12,7 @@ from edge_se_sampler.data.blender import Views, has_split, read_blender
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
-from edge_se_sampler.engine.pipeline import build_model
+from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
@@ -30,10 +30,9 @@ def prepare(config: TrainerConfig) -> Trainer:
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     plan = planned(config, views)
-    plan.pipeline.datamanager.pixel_sampler.setup(num_rays_per_batch=1)  # refuses bad settings before a folder is made
-    run = RunFolder.create(plan)
     keep_freed_memory()
-    return plan.setup(run=run, views=views, preview=preview, device=device)
+    pipeline = Pipeline.build(plan, views, device)
+    return plan.setup(run=RunFolder.create(plan), pipeline=pipeline, preview=preview)
 
 
 def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
@@ -47,7 +46,7 @@ def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     keep_freed_memory()
-    trainer = config.setup(run=run, views=views, preview=preview, device=device)
+    trainer = config.setup(run=run, pipeline=Pipeline.build(config, views, device), preview=preview)
     trainer.resume()
     return trainer
 

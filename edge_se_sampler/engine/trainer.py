@@ -11,13 +11,13 @@ from typing import Any
 
 import torch
 
-from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.tensorboard import EventWriter
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.streams import Stream, stream
@@ -32,20 +32,17 @@ class Trainer:
     Args:
         config: planned (see `plan`).
         run: where it is written.
-        views: training views.
+        pipeline: what is trained.
         preview: a view to look at while training, or None.
-        device: "cpu" or "cuda".
     """
 
-    def __init__(
-        self, config: TrainerConfig, *, run: RunFolder, views: Views, preview: Picture | None, device: str
-    ) -> None:
-        self.config, self.run, self.preview_picture = config, run, preview
+    def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
+        self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
         self.planned_steps = config.max_num_iterations or 0
-        self.pipeline = Pipeline.build(config, views, device)
         self.optimizer = torch.optim.Adam(self.pipeline.model.parameters(), lr=1.0, eps=config.optimizer.eps)
         self.next_step = 0
         self.elapsed = 0.0
+        self.events = EventWriter(run.path)
         self.stop_requested = False
         self.callbacks = self.pipeline.datamanager.get_training_callbacks(
             TrainingCallbackAttributes(pipeline=self.pipeline, trainer=self)
@@ -93,6 +90,7 @@ class Trainer:
                 if stop:
                     break
         progress.close()
+        self.events.close()
 
     def train_iteration(self, step: int) -> float:
         """One step; returns its loss."""
@@ -152,22 +150,19 @@ class Trainer:
 
     def _log(self, step: int, loss: float) -> None:
         strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
-        self.run.log(
-            {
-                "step": step,
-                "loss": loss,
-                "learning_rate": self.learning_rate(step),
-                "strategy": strategy,
-                "seconds": round(self.elapsed, 3),
-            }
-        )
+        self._record(step, loss=loss, learning_rate=self.learning_rate(step), strategy=strategy)
+
+    def _record(self, step: int, **values: Any) -> None:
+        line = {"step": step, **values, "seconds": round(self.elapsed, 3)}
+        self.run.log(line)
+        self.events.write(line)
 
     def _preview(self, step: int) -> None:
         if self.preview_picture is None:
             return
         rendered, psnr = render_view(self.pipeline.model, self.preview_picture)
         self._preview_psnr = psnr
-        self.run.log({"step": step, "val_psnr": psnr, "seconds": round(self.elapsed, 3)})
+        self._record(step, val_psnr=psnr)
         self.run.preview(step, rendered)
 
     def _note(self, loss: float) -> str:

@@ -81,7 +81,9 @@ class NeRFField(nn.Module):
 
 def _linear(in_size: int, out_size: int) -> nn.Linear:
     """A layer still to be initialised; torch's own way would draw from its global generator."""
-    return nn.utils.skip_init(nn.Linear, in_size, out_size)
+    layer = nn.utils.skip_init(nn.Linear, in_size, out_size)
+    assert isinstance(layer, nn.Linear)
+    return layer
 
 
 def initialize(layer: nn.Linear, how: str, rng: np.random.Generator) -> None:
