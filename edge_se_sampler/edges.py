@@ -49,7 +49,8 @@ def luma(image: np.ndarray, background: tuple[float, float, float] = WHITE) -> n
         image: (H, W, 3|4) float32 in [0, 1].
         background: RGB in [0, 1]; unused for three channels.
     """
-    gray = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY)
+    # not cv2.cvtColor: it rounds the ends of rows differently, and a flat image would have edges
+    gray = image[..., 0] * np.float32(0.299) + image[..., 1] * np.float32(0.587) + image[..., 2] * np.float32(0.114)
     if image.shape[2] == 3:
         return gray
     behind = np.float32(np.dot(background, (0.299, 0.587, 0.114)))
@@ -59,7 +60,8 @@ def luma(image: np.ndarray, background: tuple[float, float, float] = WHITE) -> n
 def _sobel(gray: np.ndarray) -> np.ndarray:
     gx = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=3, scale=0.25, borderType=cv2.BORDER_REPLICATE)
     gy = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=3, scale=0.25, borderType=cv2.BORDER_REPLICATE)
-    return cv2.magnitude(gx, gy)
+    # not cv2.magnitude: its rounding depends on where in memory its answer lies
+    return np.sqrt(gx * gx + gy * gy)
 
 
 def _laplacian(gray: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from tiny import tiny_views
@@ -10,7 +12,11 @@ from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.engine.camera_path import spiral
 
-LIKE = cameras_of(tiny_views(height=8, width=6))
+VIEWS = tiny_views(height=8, width=6)
+FOCAL = np.array([[7.0, 8.0], [9.0, 10.0], [11.0, 12.0]])
+LIKE = cameras_of(
+    replace(VIEWS, focal=FOCAL, principal=FOCAL / 2, images=(VIEWS.images[0], *tiny_views(2, 4, 5).images))
+)
 LIKE.camera_to_worlds[0, :, 3] = torch.tensor([0.0, 3.0, 4.0])  # 5, 4 and 4 units away
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,7 +117,7 @@ def test_a_slice_of_rays_is_those_rays() -> None:
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The same three views: centred at 24 x 24, and with the object 8 right of and 4 above the middle of 40 x 40."""
     out = tmp_path_factory.mktemp("placed")
-    counts = {"num_train": 3, "num_val": 0, "num_test": 0}
+    counts: Any = {"num_train": 3, "num_val": 0, "num_test": 0}
     return {
         "centered": make_scenes(out / "c", ["bricks"], size=24, **counts)[0],
         "shifted": make_scenes(out / "s", ["bricks"], size=40, placement="shifted", offset=(0.2, -0.1), **counts)[0],

@@ -11,7 +11,7 @@ import torch
 from goodness import ALPHA, p_value, pixel_counts
 from torch import Tensor
 
-from edge_se_sampler.distribution import FULL, PixelTable, B
+from edge_se_sampler.distribution import FULL, B, PixelTable
 from edge_se_sampler.edges import edge_strength
 
 QUANTUM = 2**-30
@@ -310,16 +310,16 @@ def test_relative_is_probability_times_drawable_pixels() -> None:
     table = table_of(*IMAGES)
     chosen = torch.tensor([5, 2, 0, 3])
     drawn = table.draw(chosen, 500, np.random.default_rng(0))
-    relative = table.relative(chosen, drawn).tolist()
-    for (position, row, column), value in zip(drawn.tolist(), relative, strict=True):
-        image = int(chosen[position])
-        p = float(table.probability(image)[row, column])
-        assert value == pytest.approx(p * np.count_nonzero(IMAGES[image]), rel=1e-12)
+    scaled = [table.probability(image) * int(np.count_nonzero(IMAGES[image])) for image in chosen.tolist()]
+    expected = [scaled[position][row, column] for position, row, column in drawn.tolist()]
+    np.testing.assert_allclose(table.relative(chosen, drawn).numpy(), expected, rtol=1e-12)
 
 
 def test_relative_of_pixels_that_cannot_be_drawn_is_zero() -> None:
     table = table_of(*IMAGES)
-    assert table.relative(torch.tensor([1, 5, 4]), torch.tensor([[0, 0, 0], [1, 0, 0], [2, 49, 49]])).tolist() == [0] * 3
+    assert (
+        table.relative(torch.tensor([1, 5, 4]), torch.tensor([[0, 0, 0], [1, 0, 0], [2, 49, 49]])).tolist() == [0] * 3
+    )
 
 
 def test_the_quantum_is_where_documented() -> None:
@@ -393,11 +393,11 @@ def test_bad_strengths_are_refused_and_leave_the_table_as_it_was(bad: list) -> N
     assert len(table) == 1
     assert torch.equal(table.draw(torch.tensor([0]), 100, np.random.default_rng(0)), before)
     table.add([torch.ones(2, 2)])
-    assert table.probability(1).tolist() == [[0.25, 0.25], [0.25, 0.25]]
+    np.testing.assert_allclose(table.probability(1).numpy(), np.full((2, 2), 0.25), atol=QUANTUM)
 
 
-@pytest.mark.xfail(strict=True, reason="float64 sums beyond about 1e-299 or 1e308 overflow the scale in _level")
-@pytest.mark.parametrize("scale", [1e-310, 1e-300, 1e308])
+@pytest.mark.xfail(strict=True, reason="float64 sums beyond about 1e-299 and 1e308 overflow the scale in _level")
+@pytest.mark.parametrize("scale", [1e-310, 1e-304, 1e308])
 def test_float64_strengths_of_any_scale(scale: float) -> None:
     p = table_of(np.full((40, 40), scale)).probability(0)
     np.testing.assert_allclose(p.numpy(), 1 / 1600, rtol=1e-6)

@@ -20,14 +20,15 @@ HEAVY = {"torch", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio"}
         ("sampling_settings", set()),
         ("methods", {"tyro"}),
         ("edges", {"cv2"}),
-        ("ranking", {"torch"}),
         ("distribution", {"torch"}),
         ("datamanager", {"torch", "cv2"}),  # and image_batch, pixel_sampler
     ],
 )
 def test_importing_a_module_loads_only_what_it_needs(module: str, allowed: set[str]) -> None:
     code = f"import sys, edge_se_sampler.{module}; print(*sys.modules)"
-    loaded = set(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split())
+    loaded = set(
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    )
     assert f"edge_se_sampler.{module}" in loaded
     assert loaded & HEAVY == allowed
     if module != "methods":  # the core stays below data, engine, nerf and the command line

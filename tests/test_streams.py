@@ -45,8 +45,7 @@ def test_purposes_never_change_their_number() -> None:
 
 def test_no_two_streams_begin_alike() -> None:
     starts = [
-        stream(seed, step, purpose).random()
-        for seed, step, purpose in itertools.product(range(20), range(20), Stream)
+        stream(seed, step, purpose).random() for seed, step, purpose in itertools.product(range(20), range(20), Stream)
     ]
     assert len(set(starts)) == len(starts)
 

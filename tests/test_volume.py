@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def test_one_slab_is_exact_however_it_is_sampled() -> None:
     """Density 1.3 between 1 and 3: Beer-Lambert, if samples lie on both faces, wherever the others are."""
     inside = 1 + 2 * unit_draws(20)
     t = torch.cat((torch.tensor([0.5, 1.0]), inside, torch.tensor([3.0, 3.7]))).sort().values
-    sigma = torch.where((t >= 1) & (t < 3), 1.3, 0.0)
+    sigma = 1.3 * ((t >= 1) & (t < 3)).double()
     through = math.exp(-1.3 * 2)
     color = rendered(t, sigma, RED.expand(len(t), 3))
     torch.testing.assert_close(color, RED * (1 - through) + BACKGROUND * through, rtol=0, atol=1e-14)
@@ -43,7 +44,7 @@ def test_one_slab_is_exact_however_it_is_sampled() -> None:
 def test_two_slabs_of_different_density_and_colour_are_exact() -> None:
     t = torch.cat((torch.tensor([0.2, 1.0, 2.0, 2.5, 4.0]), 1 + 3.5 * unit_draws(40, 1))).sort().values
     first, second = (t >= 1) & (t < 2), (t >= 2.5) & (t < 4)
-    sigma = 0.7 * first + 1.9 * second
+    sigma = 0.7 * first.double() + 1.9 * second.double()
     colors = torch.where(first[:, None], RED, BLUE)
     past_first, past_second = math.exp(-0.7 * 1), math.exp(-1.9 * 1.5)
     expected = RED * (1 - past_first) + past_first * (BLUE * (1 - past_second) + past_second * BACKGROUND)
@@ -62,14 +63,14 @@ def test_colour_that_changes_along_the_ray_converges_to_its_integral() -> None:
         color = rendered(t, sigma, t[:, None].expand(-1, 3), torch.zeros(3, dtype=torch.float64))
         errors.append(abs(float(color[0]) - expected))
     assert errors[2] < 5e-4
-    for coarse, fine in zip(errors, errors[1:], strict=False):  # first order
+    for coarse, fine in pairwise(errors):  # first order
         assert 8 < coarse / fine < 12
 
 
 def test_faces_between_samples_converge() -> None:
     """Slabs of the ordinary case: no sample on a face."""
     t = torch.from_numpy(np.sort(np.random.default_rng(2).uniform(0, 5, 20_000)))
-    sigma = torch.where((t >= 1) & (t < 3), 1.3, 0.0)
+    sigma = 1.3 * ((t >= 1) & (t < 3)).double()
     through = math.exp(-1.3 * 2)
     expected = RED * (1 - through) + BACKGROUND * through
     torch.testing.assert_close(rendered(t, sigma, RED.expand(len(t), 3)), expected, rtol=0, atol=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import resource
@@ -37,7 +38,12 @@ def _processor() -> str:
         return platform.processor()
 
 
-def peak_memory() -> int:
-    """Bytes that this process has held resident at most so far."""
+def resident_memory(what: str = "VmRSS") -> int:
+    """Bytes that this process holds resident now ("VmRSS"), or has held at most ("VmHWM").
+
+    From /proc: getrusage's maximum counts the parent's memory before exec. Elsewhere than Linux it has to do.
+    """
+    with contextlib.suppress(OSError), open("/proc/self/status") as file:
+        return next(1024 * int(line.split()[1]) for line in file if line.startswith(what))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if platform.system() == "Darwin" else peak * 1024

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.machine import machine, peak_memory
+from edge_se_sampler.bench.machine import machine, resident_memory
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.distribution import PixelTable, UniformPixels
 from edge_se_sampler.edges import edge_strength
@@ -80,7 +80,7 @@ def build_tables(images: int, size: int, progress: Progress) -> tuple[PixelTable
     """Edge tables of noise images: the tables, and what building them took."""
     noise = [np.random.default_rng(i).integers(0, 256, (size, size, 4), dtype=np.uint8) for i in range(min(images, 8))]
     table = PixelTable()
-    before = peak_memory()
+    before = resident_memory()
     began = time.perf_counter()
 
     def strength(i: int) -> torch.Tensor:
@@ -95,7 +95,7 @@ def build_tables(images: int, size: int, progress: Progress) -> tuple[PixelTable
         "pixels": pixels,
         "build_seconds": seconds,
         "bytes_per_pixel": table.nbytes / pixels,
-        "peak_bytes_per_pixel_while_building": (peak_memory() - before) / pixels,
+        "peak_bytes_per_pixel_while_building": (resident_memory("VmHWM") - before) / pixels,
     }
 
 
@@ -141,20 +141,21 @@ def memory_ratio(rays: int = 1024) -> dict[str, float]:
 def training_peak(method: str, rays: str) -> int:
     """Resident bytes, above the level after imports, of a few late training steps of the small network."""
     noise = np.random.default_rng(0).integers(0, 256, (8, 100, 100, 3), dtype=np.uint8)
-    poses = np.tile(np.eye(4)[:3] + 4 * np.eye(4)[2:3].T @ np.eye(4)[3:], (8, 1, 1))
+    pose = np.eye(4)[:3]
+    pose[2, 3] = 4
     lens = np.full((8, 2), 100.0)
-    views = Views(tuple("abcdefgh"), tuple(noise), None, poses, lens, lens / 2)
+    views = Views(tuple("abcdefgh"), tuple(noise), None, np.tile(pose, (8, 1, 1)), lens, lens / 2)
     config = registered_methods()[method].specification.config
     sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=int(rays), pixel_sampler=sampler)
     model = replace(config.pipeline.model, size="small")
     config = planned(replace(config, pipeline=replace(config.pipeline, datamanager=manager, model=model)), views)
-    before = peak_memory()
+    before = resident_memory()
     pipeline = Pipeline.build(config, views, "cpu")
     trainer = config.setup(run=RunFolder(Path("never-written")), pipeline=pipeline, preview=None)
     for step in range(3):
         trainer.train_iteration(step)
-    return peak_memory() - before
+    return resident_memory("VmHWM") - before
 
 
 def table_of(result: dict[str, Any]) -> str:

@@ -51,7 +51,7 @@ class DataManager:
         """The rays of a training step and their pixels: "image" (N, 3|4) in [0, 1], "indices" (N, 3), ..."""
         batch = self.train_pixel_sampler.sample(self.image_batch)
         batch["image"] = unit_interval(batch["image"])
-        batch = {key: value.to(self.device) for key, value in batch.items() if key != "full_image"}
+        batch |= {key: value.to(self.device) for key, value in batch.items() if key != "full_image"}
         return self.train_ray_generator(batch["indices"]), batch
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:

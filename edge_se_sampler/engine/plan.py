@@ -50,20 +50,23 @@ def _check(plan: TrainerConfig) -> None:
         "steps-per-eval-image": plan.steps_per_eval_image,
         "steps-per-log": plan.steps_per_log,
         "pipeline.datamanager.train-num-rays-per-batch": plan.pipeline.datamanager.train_num_rays_per_batch,
-        "pipeline.model.width": model.width,
         "pipeline.model.depth": model.depth,
         "pipeline.model.num-importance-samples": model.num_importance_samples,
     }
     for flag, value in at_least_one.items():
         if value is None or value < 1:
             raise InputError(f"--{flag} is {value}: must be at least 1")
+    if model.width is None or model.width < 2:
+        raise InputError(
+            f"--pipeline.model.width is {model.width}: must be at least 2 (the direction's layer has half)"
+        )
     if (model.num_coarse_samples or 0) < 3:
         raise InputError(f"--pipeline.model.num-coarse-samples is {model.num_coarse_samples}: must be at least 3")
     for flag, frequencies in (("position", model.position_frequencies), ("direction", model.direction_frequencies)):
         if frequencies is None or not 0 <= frequencies <= 24:
             raise InputError(f"--pipeline.model.{flag}-frequencies is {frequencies}: must be between 0 and 24")
     if not 0 <= model.near < model.far < float("inf"):
-        raise InputError(f"--pipeline.model.near {model.near} must be at least 0 and below --pipeline.model.far")
+        raise InputError(f"--pipeline.model.near is {model.near}, --pipeline.model.far {model.far}: 0 <= near < far")
     if not 0 <= model.density_noise < float("inf"):
         raise InputError(f"--pipeline.model.density-noise is {model.density_noise}: must be at least 0")
     if plan.max_seconds is not None and not plan.max_seconds > 0:
@@ -72,7 +75,7 @@ def _check(plan: TrainerConfig) -> None:
         raise InputError(f"--optimizer.lr is {plan.optimizer.lr}: must be above 0")
     if not 0 < plan.optimizer.final_fraction <= 1:
         raise InputError(f"--optimizer.final-fraction is {plan.optimizer.final_fraction}: must be in (0, 1]")
-    if plan.optimizer.eps < 0:
+    if not 0 <= plan.optimizer.eps < float("inf"):
         raise InputError(f"--optimizer.eps is {plan.optimizer.eps}: must be at least 0")
     for name in (plan.method_name, plan.experiment_name):
         if name in (None, "", ".", "..") or "/" in str(name) or "\0" in str(name):

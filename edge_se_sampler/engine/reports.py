@@ -20,7 +20,7 @@ from edge_se_sampler.engine.files import write_image, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_views, test_pictures
-from edge_se_sampler.engine.video import check_video_path, write_video
+from edge_se_sampler.engine.video import check_video, write_video
 from edge_se_sampler.errors import InputError
 
 
@@ -65,7 +65,7 @@ def render_run(run: Path, output_path: Path, kind: str, num_frames: int, frames_
     Raises:
         InputError: a bad run, or an output that cannot be written.
     """
-    check_video_path(output_path)
+    check_video(output_path, frames_per_second)
     if num_frames < 1 or frames_per_second < 1:
         raise InputError("--num-frames and --frames-per-second must be at least 1")
     config, model, _ = load_model(RunFolder(run))

@@ -23,7 +23,8 @@ from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbac
 from edge_se_sampler.streams import Stream, stream
 
 POINTS_PER_CHUNK = 16_384
-"""Network evaluations that are differentiated at once: the activations of more fall out of the CPU's caches."""
+"""Network evaluations that are differentiated at once on a CPU: it bounds the memory. Each chunk draws its own jitter,
+so another value gives another (equally good) run."""
 
 
 class Trainer:
@@ -101,9 +102,12 @@ class Trainer:
         model.reseed(int(stream(self.config.machine.seed, step, Stream.MODEL).integers(2**63)))
         rays, batch = self.pipeline.datamanager.next_train(step)
         self.optimizer.zero_grad(set_to_none=False)
+        batch.pop("full_image", None)  # not of these rays alone
         loss = torch.zeros((), device=model.device)
         for rows in self._chunks(len(rays)):
-            part = model.loss(model(rays[rows]), {key: value[rows] for key, value in batch.items()})
+            part = model.loss(
+                model(rays[rows]), {key: value[rows] for key, value in batch.items() if key != "full_image"}
+            )
             part = part.sum() / len(rays)
             part.backward()
             loss += part.detach()

@@ -11,12 +11,15 @@ from edge_se_sampler.engine.files import eight_bit, write_atomically
 from edge_se_sampler.errors import InputError
 
 
-def check_video_path(path: Path) -> None:
+def check_video(path: Path, frames_per_second: int) -> None:
     """Refuse early what `write_video` could not write.
 
     Raises:
-        InputError: neither .gif nor .mp4, the [video] extra is missing, or there is no such folder.
+        InputError: neither .gif nor .mp4, too fast for a GIF (its delays are hundredths of a second), the [video]
+            extra is missing, or there is no such folder.
     """
+    if path.suffix.lower() == ".gif" and frames_per_second > 50:
+        raise InputError(f"--frames-per-second is {frames_per_second}: a GIF has at most 50; use .mp4")
     if path.suffix.lower() not in (".gif", ".mp4"):
         raise InputError(f"--output-path {path}: must end in .gif or .mp4")
     if not path.parent.is_dir():

@@ -29,7 +29,7 @@ class NeRFModelConfig(InstantiateConfig):
     num_importance_samples: int | None = None
     """Further samples of the fine network, where the coarse one has seen something."""
     density_activation: Literal["relu", "softplus"] = "relu"
-    """What makes the raw density non-negative; softplus (shifted by 1) cannot die."""
+    """What makes the raw density non-negative; softplus (shifted by 1, the last interval finite) cannot die."""
     initialization: Literal["xavier", "torch"] = "xavier"
     """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
     density_noise: float = 0.0

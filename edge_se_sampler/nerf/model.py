@@ -101,7 +101,9 @@ class NeRFModel(nn.Module):
             some_density, some_color = field(positions[packed], rays.directions, ray, noise)
             density = t.new_zeros(t.numel()).index_put((packed,), some_density)
             color = t.new_zeros((t.numel(), 3)).index_put((packed,), some_color)
-        weights = sample_weights(density.reshape(t.shape), intervals(t))
+        # a softplus is never 0: over an endless interval it would hide every background
+        delta = intervals(t, endless=self.config.density_activation == "relu")
+        weights = sample_weights(density.reshape(t.shape), delta)
         return weights, composite(weights, color.reshape(*t.shape, 3), background)
 
     def _noise(self, count: int) -> Tensor | None:

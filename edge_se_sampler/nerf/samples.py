@@ -36,7 +36,7 @@ def importance(edges: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
 
     Args:
         edges: (n, b + 1), ascending: ends of the bins.
-        weights: (n, b), >= 0; 1e-5 is added, so that an empty ray is sampled evenly.
+        weights: (n, b) in [0, 1]; 1e-5 is added, so that an empty ray is sampled evenly.
         uniform: (n, m) in [0, 1].
 
     Returns:

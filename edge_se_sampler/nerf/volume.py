@@ -18,9 +18,10 @@ FAR_AWAY = 1e10
 """Length of the last interval."""
 
 
-def intervals(t: Tensor) -> Tensor:
-    """delta: (n, s) -> (n, s)."""
-    return torch.cat((t[:, 1:] - t[:, :-1], torch.full_like(t[:, :1], FAR_AWAY)), dim=1)
+def intervals(t: Tensor, *, endless: bool = True) -> Tensor:
+    """delta: (n, s) -> (n, s); the last reaches to infinity, or is as long as the one before it."""
+    delta = t[:, 1:] - t[:, :-1]
+    return torch.cat((delta, torch.full_like(t[:, :1], FAR_AWAY) if endless else delta[:, -1:]), dim=1)
 
 
 def sample_weights(sigma: Tensor, delta: Tensor) -> Tensor:
