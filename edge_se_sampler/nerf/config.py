@@ -55,7 +55,7 @@ class SizePreset:
 SIZES: dict[str, SizePreset] = {
     "paper": SizePreset(NeRFModelConfig("paper", 256, 8, 10, 4, 64, 128), 5e-4, 1024, 200_000),
     "small": SizePreset(NeRFModelConfig("small", 128, 4, 8, 3, 48, 48), 2e-3, 512, 20_000),
-    "tiny": SizePreset(NeRFModelConfig("tiny", 64, 4, 6, 2, 32, 32), 5e-3, 512, 2_000),
+    "tiny": SizePreset(NeRFModelConfig("tiny", 64, 4, 6, 2, 32, 32), 5e-3, 512, 1_500),
 }
 
 

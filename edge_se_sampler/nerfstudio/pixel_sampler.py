@@ -16,6 +16,8 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.pixel_sampler import ImportantPixels
 from edge_se_sampler.sampling_settings import SamplingSettings
 
+INSTEAD = "take one of nerfstudio's own methods, whose sampler knows them"
+
 
 @dataclass
 class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
@@ -36,9 +38,9 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
             )
         # both come from the cameras: the host's sampler then draws by solid angle, or inside the crop circle alone
         if bool(self.is_equirectangular):
-            raise InputError("the cameras are equirectangular: important pixels are drawn of perspective images only")
+            raise InputError("the cameras are equirectangular: important pixels suit other cameras only; " + INSTEAD)
         if self.fisheye_crop_radius is not None:
-            raise InputError("the cameras have a fisheye_crop_radius: important pixels are drawn of whole images only")
+            raise InputError("the cameras have a fisheye_crop_radius: important pixels ignore it; " + INSTEAD)
 
 
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
