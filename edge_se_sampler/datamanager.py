@@ -30,17 +30,17 @@ class SamplerHooks:
         """The host's callback that calls func(step=...) before every training iteration."""
         raise NotImplementedError
 
+    def plan(self, trainer: Any) -> dict[str, int]:
+        """`planned_steps` and `seed` of the run, as ImportantPixels.bind takes them."""
+        return {"planned_steps": trainer.config.max_num_iterations, "seed": trainer.config.machine.seed}
+
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
         """The host's callbacks, and the one that tells the sampler the step."""
         callbacks = super().get_training_callbacks(training_callback_attributes)  # type: ignore[misc]
         sampler = self.train_pixel_sampler
         if isinstance(sampler, ImportantPixels):
-            trainer = training_callback_attributes.trainer.config
-            sampler.bind(
-                squared_error=partial(self.squared_error, training_callback_attributes.pipeline),
-                planned_steps=trainer.max_num_iterations,
-                seed=trainer.machine.seed,
-            )
+            squared_error = partial(self.squared_error, training_callback_attributes.pipeline)
+            sampler.bind(squared_error=squared_error, **self.plan(training_callback_attributes.trainer))
             callbacks.append(self.before_iteration(sampler.set_step))
         return callbacks
 

@@ -52,6 +52,7 @@ class ImportantPixels:
         # hosts share one config between training and evaluation, and write into it
         super().__init__(copy.copy(config), **kwargs)  # pyright: ignore[reportCallIssue]
         self.config.check()
+        # RGB that edges are taken in front of; fixed once a table of edges exists
         self.background: tuple[float, float, float] = kwargs.get("background_color") or WHITE
         self._squared_error: SquaredError | None = None
         self._early_steps = 0.0

@@ -11,7 +11,6 @@ import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from functools import partial
 from typing import Any
 
 import torch
@@ -65,21 +64,17 @@ class EdgeSEDataManager(SamplerHooks, VanillaDataManager):
 
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
         """nerfstudio's callbacks and ours; called once the checkpoint, if there is one, has been loaded."""
-        callbacks = super().get_training_callbacks(training_callback_attributes)
-        sampler, pipeline = self.train_pixel_sampler, training_callback_attributes.pipeline
-        if isinstance(sampler, ImportantPixels):
-            trainer = training_callback_attributes.trainer.config
-            if not self.planned_steps:
-                self.planned_steps.fill_(trainer.max_num_iterations)
-            # every process of a distributed run has a sampler of its own, and must not draw the others' pixels
-            rank = trainer.machine.machine_rank * trainer.machine.num_devices + self.local_rank
-            sampler.bind(
-                squared_error=partial(self.squared_error, pipeline),
-                planned_steps=int(self.planned_steps),
-                seed=trainer.machine.seed + (rank << 32),
-            )
-            sampler.background = shade_behind(pipeline.model)
-        return callbacks
+        if isinstance(self.train_pixel_sampler, ImportantPixels):
+            self.train_pixel_sampler.background = shade_behind(training_callback_attributes.pipeline.model)
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def plan(self, trainer: Any) -> dict[str, int]:
+        """The first run's number of steps, and a seed for each process of a distributed run."""
+        if not self.planned_steps:
+            self.planned_steps.fill_(trainer.config.max_num_iterations)
+        machine = trainer.config.machine
+        rank = machine.machine_rank * machine.num_devices + self.local_rank
+        return {"planned_steps": int(self.planned_steps), "seed": machine.seed + (rank << 32)}
 
     def before_iteration(self, func: Any) -> TrainingCallback:
         """func(step=...) before every training iteration."""
