@@ -261,18 +261,23 @@ def test_no_random_number_reaches_a_pixel_of_strength_zero(images: list[np.ndarr
 
 
 @pytest.mark.parametrize("images", [1, 2, 3, 7, 100, 1000])
-def test_the_ends_of_an_image_stay_in_it(images: int) -> None:
-    # the last number of image k is a hair under the first of image k + 1
+@pytest.mark.parametrize("order", ["ascending", "descending", "the last alone", "the last but one alone"])
+def test_the_ends_of_an_image_stay_in_it(images: int, order: str) -> None:
+    # the last number of one image is a hair under the first of the next, and rounds up to it if added carelessly
     table = table_of(*[np.ones((1, 2), dtype=np.float32)] * images)
-    first = np.arange(images) / images
+    chosen = {
+        "ascending": torch.arange(images),
+        "descending": torch.arange(images).flip(0),
+        "the last alone": torch.tensor([images - 1]),
+        "the last but one alone": torch.tensor([max(images - 2, 0)]),
+    }[order]
+    first = np.arange(len(chosen)) / len(chosen)
     last = np.append(np.nextafter(first[1:], 0), np.nextafter(1, 0))
-    numbers = np.concatenate((first, last, np.nextafter(first, 1)))
+    numbers = np.sort(np.concatenate((first, last, np.nextafter(first, 1))))
     given = Given(np.stack((numbers, np.full_like(numbers, 0.9), np.full_like(numbers, 0.9))))
-    drawn = table.draw(torch.arange(images), len(numbers), given)  # pyright: ignore[reportArgumentType]
-    expected = np.minimum((np.sort(numbers) * images).astype(int), images - 1)
-    assert drawn[:, 0].tolist() == expected.tolist()
-    assert (drawn[:, 1] == 0).all()
-    assert drawn[:, 2].max() <= 1
+    drawn = table.draw(chosen, len(numbers), given)  # pyright: ignore[reportArgumentType]
+    assert drawn[:, 0].tolist() == (numbers * len(chosen)).astype(int).tolist()
+    assert (drawn[:, 1:] == torch.tensor([0, 1])).all()
 
 
 def test_probability_is_zero_exactly_where_strength_is() -> None:

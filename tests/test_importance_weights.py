@@ -28,7 +28,7 @@ def batch_means(host: dict[str, Any], weighted: bool, step: int, **settings: Any
     """The (weighted) loss of many batches."""
     sampler = following(step, rays=40, planned=10**6, importance_weight=1.0, **settings)
     means = []
-    for number in range(800):
+    for number in range(500):
         sampler.set_step(step + number)
         pixels = sampler.sample(host)
         assert pixels["weight"].shape == (40,)

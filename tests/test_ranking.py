@@ -76,7 +76,7 @@ def fits_equation_7(monkeypatch: pytest.MonkeyPatch, ranks: Ranking) -> bool:
     monkeypatch.setattr(ranking, "error_ranks", ranks)
     errors = torch.tensor([0.4, 0.1, 0.5, 0.2, 0.3])
     rng = np.random.default_rng(0)
-    kept = np.bincount([int(keep_by_rank(errors, 1, rng).rows) for _ in range(10_000)], minlength=5)
+    kept = np.bincount([int(keep_by_rank(errors, 1, rng).rows) for _ in range(5_000)], minlength=5)
     return p_value(kept, np.array([4, 1, 5, 2, 3]) / 15) > ALPHA
 
 
@@ -189,7 +189,7 @@ def weighted_means(weight: Callable[[ranking.Kept, np.ndarray], np.ndarray]) -> 
     value = np.linspace(0, 1, 20) ** 2
     errors, rng = torch.from_numpy(value), np.random.default_rng(0)
     p = np.arange(1, 21) / 210
-    means = np.empty(12_000)
+    means = np.empty(8_000)
     for i in range(len(means)):
         kept = keep_by_rank(errors, 10, rng)
         means[i] = (weight(kept, p) * value[kept.rows.numpy()]).sum() / 20
