@@ -17,7 +17,8 @@ images' device (CUDA's cumulative sums need not be monotone), so that a seed dra
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -39,8 +40,9 @@ class UniformPixels:
 
     def __init__(self, sizes: Sequence[tuple[int, int]], fraction: float = 1.0):
         size = torch.tensor(sizes, dtype=torch.float64).reshape(-1, 2)
-        self.low = torch.minimum(torch.ceil(size * (1 - fraction) / 2), size - 1)
-        self.extent = torch.maximum(torch.ceil(size * (1 + fraction) / 2) - self.low, torch.ones(()))
+        low, high = (torch.ceil(size * share / 2 - 1e-9) for share in (1 - fraction, 1 + fraction))  # 0.1 is not exact
+        self.low = torch.minimum(low, size - 1)
+        self.extent = torch.maximum(high - self.low, torch.ones(()))
 
     def drawable(self, images: Tensor) -> Tensor:
         """(k,) bool: the images that have a pixel to draw; here all."""
@@ -175,6 +177,13 @@ class PixelTable:
         return p * (self._mass[node] - below)
 
 
+def in_threads(strength: Callable[[int], Tensor], images: Sequence[int], ahead: int = 16) -> Iterator[Tensor]:
+    """Strengths of images for `PixelTable.add`, computed in threads, but never more than `ahead` in advance."""
+    with ThreadPoolExecutor() as threads:
+        for start in range(0, len(images), ahead):
+            yield from threads.map(strength, images[start : start + ahead])
+
+
 def _flat(strength: Tensor) -> Tensor:
     """One image's strengths in a row, checked, and filled up with zeros to whole superblocks."""
     if strength.ndim != 2 or strength.numel() == 0:
@@ -183,6 +192,8 @@ def _flat(strength: Tensor) -> Tensor:
     low, high = (float(extreme) for extreme in torch.aminmax(flat))
     if not (low >= 0 and high < float("inf")):
         raise ValueError("strengths must be finite and >= 0")
+    if flat.dtype == torch.float64 and high > 0:
+        flat = flat / high  # sums of the largest and inverses of the smallest would overflow
     return torch.nn.functional.pad(flat, (0, -len(flat) % B**2))
 
 

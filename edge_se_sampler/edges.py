@@ -26,7 +26,7 @@ def unit_float(image: np.ndarray) -> np.ndarray:
     """The image as float32 in [0, 1]; uint8 is divided by 255.
 
     Raises:
-        ValueError: not (H, W, 3|4), neither uint8 nor float, or a value that is not finite.
+        ValueError: not (H, W, 3|4), neither uint8 nor float, or a value that is not in [0, 1].
     """
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise ValueError(f"an image must be (H, W, 3) or (H, W, 4), not {image.shape}")
@@ -34,8 +34,8 @@ def unit_float(image: np.ndarray) -> np.ndarray:
         return image.astype(np.float32) * np.float32(1 / 255)
     if not np.issubdtype(image.dtype, np.floating):
         raise ValueError(f"an image must be uint8 or float, not {image.dtype}")
-    if not np.isfinite(image).all():
-        raise ValueError("the image has values that are not finite")
+    if not (image.min() >= -1e-6 and image.max() <= 1 + 1e-6):  # false for nan, too
+        raise ValueError("a float image must be finite and in [0, 1]")
     return image.astype(np.float32, copy=False)
 
 

@@ -32,10 +32,13 @@ class ImageBatch:
         """Read a host's batch.
 
         Raises:
-            ValueError: a key that is neither stacked (k, H, W, ...) nor a list of k (H, W, ...).
+            ValueError: a key that is neither stacked (k, H, W, ...) nor a list of k (H, W, ...), or another number
+                of image numbers.
         """
         per_pixel = {key: value for key, value in image_batch.items() if key != "image_idx" and value is not None}
         sizes = _sizes(image_batch["image"])
+        if len(image_batch["image_idx"]) != len(sizes):
+            raise ValueError(f"image batch: {len(image_batch['image_idx'])} image_idx for {len(sizes)} images")
         for key, value in per_pixel.items():
             if _sizes(value) != sizes:
                 raise ValueError(f"image batch: {key!r} has not one (H, W, ...) tensor for each image")
@@ -74,6 +77,9 @@ class ImageBatch:
 
 
 def _sizes(images: Any) -> list[tuple[int, int]]:
+    """Rows and columns of k images, stacked or in a list; nothing for what holds no images."""
     if isinstance(images, Tensor):
-        return [(int(images.shape[1]), int(images.shape[2]))] * len(images)
+        return [(int(images.shape[1]), int(images.shape[2]))] * len(images) if images.ndim >= 3 else []
+    if not isinstance(images, list) or not all(isinstance(image, Tensor) and image.ndim >= 2 for image in images):
+        return []
     return [(int(image.shape[0]), int(image.shape[1])) for image in images]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.distribution import PixelTable, UniformPixels
+from edge_se_sampler.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.edges import WHITE, edge_strength
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
@@ -32,7 +31,8 @@ SquaredError = Callable[[dict[str, Any]], Tensor]
 
 @dataclass
 class _Tables:
-    """The finished tables of one way of drawing, keyed by absolute image number."""
+    """The finished tables of one way of drawing, keyed by absolute image number: an image's pixels and mask are taken
+    to stay what they were when it was first seen."""
 
     table: PixelTable
     place: dict[int, int]
@@ -100,6 +100,8 @@ class ImportantPixels:
                 background=self.background,
             )
             return edges + np.float32(self.config.edge_epsilon)
+        if strategy not in ("uniform", "precrop"):
+            raise ValueError(f"strategy {strategy!r} has no strengths; known are uniform, precrop and edge")
         size = image.shape[:2]
         inside = np.zeros(size, dtype=np.float32)
         box = UniformPixels([size], self._box_side(strategy))
@@ -130,8 +132,9 @@ class ImportantPixels:
         strategy, count = self.strategy, self.num_rays_per_batch
         if self._squared_error is None:
             self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
+        for over in set(self._tables) - {strategy, "uniform"}:
+            del self._tables[over]  # the early phase is over: give its memory back
         if strategy == "se":
-            self._tables.pop("edge", None)  # the early phase is over: give its memory back
             pixels = self._candidates(batch, count)
         else:
             pixels, weight = self._draw(batch, strategy, count)
@@ -150,8 +153,7 @@ class ImportantPixels:
         numbers = batch.numbers.tolist()
         new = [k for k, number in enumerate(numbers) if number not in tables.place]
         if new:
-            with ThreadPoolExecutor() as threads:
-                tables.table.add(threads.map(lambda k: self._valid_strength(batch, strategy, k), new))
+            tables.table.add(in_threads(lambda k: self._valid_strength(batch, strategy, k), new))
             tables.place.update({numbers[k]: len(tables.place) + i for i, k in enumerate(new)})
         return tables.table, torch.tensor([tables.place[number] for number in numbers])
 
@@ -194,6 +196,8 @@ class ImportantPixels:
         candidates = batch.gather(drawn)
         with torch.no_grad():
             errors = self._squared_error(candidates)
+        if errors.shape != (len(drawn),):
+            raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
         kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION))
         pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
         if self.config.importance_weight:

@@ -70,7 +70,8 @@ class SamplingSettings:
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run planned for that many."""
-        return self.early_steps if self.schedule == "steps" else self.early_fraction * planned_steps
+        # rounded: 0.07 * 100 is 7.000000000000001
+        return self.early_steps if self.schedule == "steps" else round(self.early_fraction * planned_steps, 6)
 
 
 @dataclass

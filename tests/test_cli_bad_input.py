@@ -31,7 +31,7 @@ def refused(edge_se: Callable, folder: Path, *arguments: object) -> str:
     return answer.err
 
 
-def spoil(scene: Path, change: Callable[[dict], None]) -> None:
+def spoil(scene: Path, change: Callable[[dict], object]) -> None:
     path = scene / "transforms_train.json"
     content = json.loads(path.read_text())
     change(content)

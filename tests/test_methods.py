@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 
 
 def test_the_six_strategies_of_the_paper():
@@ -26,8 +27,9 @@ def test_the_six_strategies_of_the_paper():
         "edge-nerf": ("edge", "uniform"),
         "edge-se-nerf": ("edge", "se"),
     }
-    assert {name: (s.early, s.late) for name, s in samplers.items()} == table
+    assert {name: (getattr(s, "early", ""), getattr(s, "late", "")) for name, s in samplers.items()} == table
     for sampler in samplers.values():  # faithful to the paper, for ever
+        assert isinstance(sampler, EdgeSEPixelSamplerConfig)
         assert (sampler.schedule, sampler.early_fraction, sampler.precrop_fraction) == ("fraction", 0.1, 0.5)
         assert (sampler.images_per_step, sampler.se_candidates, sampler.importance_weight) == ("one", 2, 0.0)
         assert (sampler.edge_filter, sampler.edge_source) == ("sobel", "color")

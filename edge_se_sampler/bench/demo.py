@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.bench.machine import machine
+from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made.folder import make_scenes
 from edge_se_sampler.engine.config import MachineConfig
-from edge_se_sampler.engine.evaluation import evaluate, psnr, target_image
+from edge_se_sampler.engine.evaluation import Picture, evaluate, pictures_of, psnr, target_image
 from edge_se_sampler.engine.files import write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
@@ -60,9 +61,10 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
         made[0].rename(scene)
         made[0].parent.rmdir()
     outcomes = [_train(method, scene, workplace, seed) for method in METHODS]
-    target, background = _ground_truth(scene)
+    test, validation = pictures_of(read_blender(scene, "test")), pictures_of(read_blender(scene, "val"))
+    background = float(np.mean([_background_psnr(picture) for picture in test]))
     _write_json(output_dir / "demo.json", outcomes, background, seed, time.monotonic() - began)
-    _draw(output_dir / "demo.png", outcomes, target, background)
+    _draw(output_dir / "demo.png", outcomes, target_image(test[0], 1.0), _background_psnr(validation[0]))
     return outcomes
 
 
@@ -96,12 +98,9 @@ def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
     )
 
 
-def _ground_truth(scene: Path) -> tuple[np.ndarray, float]:
-    """The first test view, and the PSNR over the test views of answering with the background alone."""
-    config = registered_methods()["vanilla-nerf"].specification.config
-    pictures = test_pictures(replace(config, data=scene))
-    errors = [((target_image(picture, 1.0) - 1.0) ** 2).mean() for picture in pictures]
-    return target_image(pictures[0], 1.0), float(np.mean([psnr(error) for error in errors]))
+def _background_psnr(picture: Picture) -> float:
+    """PSNR of answering with the white background alone."""
+    return psnr(float(((target_image(picture, 1.0) - 1.0) ** 2).mean()))
 
 
 def _write_json(path: Path, outcomes: list[Outcome], background: float, seed: int, seconds: float) -> None:
@@ -128,29 +127,29 @@ def _write_json(path: Path, outcomes: list[Outcome], background: float, seed: in
 
 
 def _draw(path: Path, outcomes: list[Outcome], target: np.ndarray, background: float) -> None:
-    pyplot = require_pyplot()
-    figure = pyplot.figure(figsize=(10.5, 7.4))
-    grid = figure.add_gridspec(2, 6, height_ratios=(1, 0.95), hspace=0.28, wspace=0.9)
-    pictures = [("ground truth", target)]
-    pictures += [
-        (f"{METHODS[outcome.method]}: {outcome.results['psnr']:.2f} dB", outcome.picture) for outcome in outcomes
-    ]
-    for i, (title, picture) in enumerate(pictures):
-        axis = figure.add_subplot(grid[0, 2 * i : 2 * i + 2])
+    figure = require_pyplot().figure(figsize=(10.5, 7.0))
+    top = figure.add_gridspec(1, 3, left=0.03, right=0.97, top=0.88, bottom=0.47, wspace=0.06)
+    titles = ["ground truth"]
+    titles += [f"{METHODS[outcome.method]}: {outcome.results['psnr']:.2f} dB" for outcome in outcomes]
+    pictures = [target, *(outcome.picture for outcome in outcomes)]
+    for i, (title, picture) in enumerate(zip(titles, pictures, strict=True)):
+        axis = figure.add_subplot(top[0, i])
         axis.imshow(picture, interpolation="nearest")
         axis.set_title(title)
         axis.set(xticks=[], yticks=[])
-    curves = figure.add_subplot(grid[1, :3]), figure.add_subplot(grid[1, 3:])
+    bottom = figure.add_gridspec(1, 2, left=0.07, right=0.97, top=0.38, bottom=0.08, wspace=0.12)
+    curves = figure.add_subplot(bottom[0, 0]), figure.add_subplot(bottom[0, 1])
     for outcome in outcomes:
         name, color = METHODS[outcome.method], COLORS[outcome.method]
         measured = [line["val_psnr"] for line in outcome.validation]
         for axis, x in zip(curves, ("step", "seconds"), strict=True):
             axis.plot([line[x] for line in outcome.validation], measured, color=color, label=name)
-    for axis, x in zip(curves, ("iterations", "seconds of training"), strict=True):
+    for axis, label in zip(curves, ("iterations", "seconds of training"), strict=True):
         axis.axhline(background, color="black", ls=":", lw=1, label="background alone")
-        axis.set(xlabel=x, ylabel="PSNR of a held-out view [dB]")
+        axis.set(xlabel=label)
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-    curves[0].legend(frameon=False, loc="upper left")
+    curves[0].set_ylabel("PSNR of a validation view [dB]")
+    curves[1].legend(frameon=False, loc="center right")
     figure.suptitle("The same network, the same initial weights, the same number of iterations", y=0.97)
     save_figure(figure, path)

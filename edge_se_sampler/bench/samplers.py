@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import torch
 
 from edge_se_sampler.bench.machine import machine, resident_memory
 from edge_se_sampler.data.blender import Views
-from edge_se_sampler.distribution import PixelTable, UniformPixels
+from edge_se_sampler.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.edges import edge_strength
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
@@ -87,8 +86,7 @@ def build_tables(images: int, size: int, progress: Progress) -> tuple[PixelTable
         progress.update(i)
         return torch.from_numpy(edge_strength(noise[i % len(noise)]) + EPSILON)
 
-    with ThreadPoolExecutor() as threads:
-        table.add(threads.map(strength, range(images)))
+    table.add(in_threads(strength, range(images)))
     seconds = time.perf_counter() - began
     pixels = images * size * size
     return table, {

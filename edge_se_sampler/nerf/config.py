@@ -52,10 +52,12 @@ class SizePreset:
     iterations: int
 
 
+# tiny is wide rather than deep: of 500 seeds 0.4 % begin with a network that is dead, where 4 x 64 has 3.7 % of 300,
+# at the same quality for the same steps; and of 12 its coarse or fine one died once at a rate of 5e-3, never at 3e-3
 SIZES: dict[str, SizePreset] = {
     "paper": SizePreset(NeRFModelConfig("paper", 256, 8, 10, 4, 64, 128), 5e-4, 1024, 200_000),
     "small": SizePreset(NeRFModelConfig("small", 128, 4, 8, 3, 48, 48), 2e-3, 512, 20_000),
-    "tiny": SizePreset(NeRFModelConfig("tiny", 64, 4, 6, 2, 32, 32), 5e-3, 512, 1_500),
+    "tiny": SizePreset(NeRFModelConfig("tiny", 96, 2, 6, 2, 32, 32), 3e-3, 512, 1_500),
 }
 
 

@@ -1,0 +1,73 @@
+"""Every number in the README is the committed result's, and a committed result comes out again."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge_se_sampler.bench import demo
+from edge_se_sampler.data.made import make_scenes
+from edge_se_sampler.engine.config import MachineConfig
+from edge_se_sampler.engine.session import prepare
+from edge_se_sampler.methods import registered_methods
+
+ROOT = Path(__file__).parent.parent
+
+
+def result(name: str) -> dict[str, Any]:
+    return json.loads((ROOT / "configs" / name).read_text())
+
+
+def readme_row(beginning: str) -> str:
+    (row,) = [line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(f"| {beginning}")]
+    return row.split("|")[2].strip()
+
+
+def demo_psnrs(method: str) -> str:
+    psnrs = [result(f"demo/seed-{seed}/demo.json")["methods"][method]["results"]["psnr"] for seed in (0, 1, 2)]
+    return " / ".join(f"{psnr:.2f}" for psnr in psnrs)
+
+
+def test_the_readme_quotes_the_committed_results():
+    told = f"Random {demo_psnrs('vanilla-nerf')}, Edge + SE {demo_psnrs('edge-se-nerf')} dB"
+    assert readme_row("demo") == told
+    assert told in " ".join((ROOT / "README.md").read_text().split())
+    quality = result("quality/result.json")
+    assert quality["seed"] == 0
+    assert quality["seconds"] <= 180
+    assert readme_row("bricks") == f"{quality['results']['psnr']:.2f} dB after {quality['seconds']:.0f} s"
+    bench = result("samplers/result.json")
+    assert bench["pixels"] == 64_000_000
+    assert readme_row("tables") == f"{bench['build_seconds']:.1f} s, {bench['bytes_per_pixel']:.2f} bytes a pixel"
+    times = bench["milliseconds"]
+    told = f"{times['edge_all_images']:.2f} ms from 100 images, {times['edge_one_image']:.2f} ms from one"
+    assert readme_row("4096") == f"{told} (a flat searchsorted: {times['flat_searchsorted']:.2f} ms)"
+    assert readme_row("training memory") == f"{bench['training_memory']['ratio']:.3f} x"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", demo.METHODS)
+def test_the_demo_comes_out_again(method: str, tmp_path: Path):
+    """Its first 40 steps, on whatever machine this is: rounding grows with the steps, so the bound is loose."""
+    (scene,) = make_scenes(
+        tmp_path, [demo.SCENE], size=demo.SIZE, num_train=50, num_val=1, num_test=10, placement="shifted",
+        offset=demo.OFFSET,
+    )  # fmt: skip
+    config = registered_methods()[method].specification.config
+    trainer = prepare(
+        replace(
+            config,
+            data=scene,
+            output_dir=tmp_path / "runs",
+            max_num_iterations=demo.ITERATIONS,
+            machine=MachineConfig(seed=0, device_type="cpu"),
+        )
+    )
+    losses = [trainer.train_iteration(step) for step in range(41)]
+    for line in result("demo/seed-0/demo.json")["methods"][method]["loss"][:5]:
+        assert math.isclose(losses[line["step"]], line["loss"], rel_tol=0.02), line
