@@ -17,7 +17,6 @@ from torch import Tensor
 from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import cameras_of
-from edge_se_sampler.engine import evaluation
 from edge_se_sampler.engine.evaluation import (
     Picture,
     evaluate,
@@ -29,6 +28,7 @@ from edge_se_sampler.engine.evaluation import (
     ssim,
     target_image,
 )
+from edge_se_sampler.nerf import model as model_module
 from edge_se_sampler.nerf.model import NeRFModel
 
 HEIGHT, WIDTH = 20, 24
@@ -265,7 +265,7 @@ def test_chunks_leave_no_seam_and_the_mode_as_it_was(training: bool, monkeypatch
     picture = pictures_of(tiny_views(1, 5, 7))[0]
     rays = picture.rays(torch.device("cpu"))
     whole = {key: render_rays(model, rays, key) for key in ("rgb_fine", "depth_fine")}
-    monkeypatch.setattr(evaluation, "RAYS_PER_CHUNK", 4)
+    monkeypatch.setattr(model_module, "POINTS_PER_CHUNK", {"cpu": 100})
     for key, value in whole.items():
         chunked = render_rays(model, rays, key)
         torch.testing.assert_close(chunked, value, rtol=1e-5, atol=1e-6)

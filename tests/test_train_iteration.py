@@ -11,13 +11,13 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_views
 
-from edge_se_sampler.engine import trainer as trainer_module
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.nerf import model as model_module
 
 VIEWS = tiny_views(3, 12, 12)
 RAYS = 37
@@ -46,7 +46,7 @@ def test_gradients_gathered_chunk_by_chunk_are_those_of_the_whole(
     points = 2 * 6 + 5
     found = []
     for chunk in (rays_a_chunk, 1000):
-        monkeypatch.setattr(trainer_module, "POINTS_PER_CHUNK", chunk * points + 3)
+        monkeypatch.setattr(model_module, "POINTS_PER_CHUNK", {"cpu": chunk * points + 3})
         trainer = trainer_of(density_activation="softplus")
         model = trainer.pipeline.model
         sizes = []

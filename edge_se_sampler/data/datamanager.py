@@ -64,7 +64,9 @@ class VanillaDataManager(SamplerHooks, DataManager):
 
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
         """(n,) squared errors of the model's fine colours, in training mode."""
-        return model.squared_error(model(ray_bundle), unit_interval(batch["image"]).to(self.device))
+        image = unit_interval(batch["image"]).to(self.device)
+        parts = [model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in model.chunks(len(ray_bundle))]
+        return torch.cat(parts)
 
     def before_iteration(self, func: Any) -> TrainingCallback:
         """func(step=...) before every training iteration."""

@@ -21,7 +21,6 @@ from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.edges import edge_strength, unit_float
 from edge_se_sampler.nerf.model import NeRFModel, target_colors
 
-RAYS_PER_CHUNK = 1024
 EDGE_BAND_SHARE = 0.1
 """The edge band: the share of pixels with the strongest Sobel response, and their neighbours."""
 
@@ -58,9 +57,7 @@ def render_rays(model: NeRFModel, rays: RayBundle, key: str = "rgb_fine") -> tor
     was_training = model.training
     model.eval()
     with torch.no_grad():
-        rendered = [
-            model(rays[start : start + RAYS_PER_CHUNK])[key].cpu() for start in range(0, len(rays), RAYS_PER_CHUNK)
-        ]
+        rendered = [model(rays[rows])[key].cpu() for rows in model.chunks(len(rays))]
     model.train(was_training)
     return torch.cat(rendered)
 

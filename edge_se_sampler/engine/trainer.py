@@ -22,10 +22,6 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.streams import Stream, stream
 
-POINTS_PER_CHUNK = 16_384
-"""Network evaluations that are differentiated at once on a CPU: it bounds the memory. Each chunk draws its own jitter,
-so another value gives another (equally good) run."""
-
 
 class Trainer:
     """Trains a model into a run folder.
@@ -104,7 +100,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=False)
         batch.pop("full_image", None)  # not of these rays alone
         loss = torch.zeros((), device=model.device)
-        for rows in self._chunks(len(rays)):
+        for rows in model.chunks(len(rays)):
             part = model.loss(
                 model(rays[rows]), {key: value[rows] for key, value in batch.items() if key != "full_image"}
             )
@@ -145,12 +141,6 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
         }
         save_checkpoint(self.run.checkpoints, self.next_step - 1, state)
-
-    def _chunks(self, rays: int) -> Iterator[slice]:
-        model = self.config.pipeline.model
-        points = 2 * (model.num_coarse_samples or 0) + (model.num_importance_samples or 0)
-        size = max(1, POINTS_PER_CHUNK // points) if self.pipeline.model.device.type == "cpu" else rays
-        return (slice(start, start + size) for start in range(0, rays, size))
 
     def _log(self, step: int, loss: float) -> None:
         strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -13,6 +13,10 @@ from edge_se_sampler.nerf.config import NeRFModelConfig
 from edge_se_sampler.nerf.field import NeRFField
 from edge_se_sampler.nerf.samples import importance, stratified
 from edge_se_sampler.nerf.volume import composite, intervals, sample_weights
+
+POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
+"""Network evaluations rendered at once, by device: it bounds the memory. Each chunk draws its own jitter, so another
+value gives another (equally good) training run."""
 
 
 class NeRFModel(nn.Module):
@@ -37,6 +41,12 @@ class NeRFModel(nn.Module):
     def device(self) -> torch.device:
         """Where the weights are."""
         return self.coarse.density.weight.device
+
+    def chunks(self, rays: int) -> Iterator[slice]:
+        """Rows of that many rays, as many at a time as are worth rendering at once."""
+        points = 2 * (self.config.num_coarse_samples or 0) + (self.config.num_importance_samples or 0)
+        size = max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points)
+        return (slice(start, start + size) for start in range(0, rays, size))
 
     def reseed(self, seed: int) -> None:
         """Make the randomness of what follows a function of the seed."""
