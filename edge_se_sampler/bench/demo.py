@@ -93,7 +93,7 @@ def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
         trainer.elapsed,
         [line for line in metrics if "loss" in line],
         [line for line in metrics if "val_psnr" in line],
-        results | {"config": config_to_json(trainer.config), "run": str(trainer.run.path)},
+        results | {"config": config_to_json(replace(trainer.config, data=Path(scene.name), output_dir=Path("runs")))},
         first[0],
     )
 
