@@ -35,7 +35,7 @@ def unit_float(image: np.ndarray) -> np.ndarray:
     if not np.issubdtype(image.dtype, np.floating):
         raise ValueError(f"an image must be uint8 or float, not {image.dtype}")
     if not (image.min() >= -1e-6 and image.max() <= 1 + 1e-6):  # false for nan, too
-        raise ValueError("a float image must be finite and in [0, 1]")
+        raise ValueError("the image has values that are not finite, or not in [0, 1]")
     return image.astype(np.float32, copy=False)
 
 

@@ -297,3 +297,11 @@ def test_a_value_that_is_not_finite_is_refused(bad: float, at: tuple[int, int, i
 def test_alpha_edges_without_alpha_are_refused(source: Any) -> None:
     with pytest.raises(ValueError, match=rf"{source}.*no.*use 'color'"):
         edge_strength(random_image((4, 4), 3), source=source)
+
+
+@pytest.mark.parametrize("value", [-0.5, 1.5, 255.0])
+def test_a_float_image_beyond_the_unit_interval_is_refused(value: float) -> None:
+    image = np.full((4, 5, 3), 0.5)
+    image[2, 3, 1] = value
+    with pytest.raises(ValueError, match=r"not in \[0, 1\]"):
+        edge_strength(image)
