@@ -10,7 +10,7 @@ B       children of a node: B consecutive pixels (row-major) make a block, B blo
 Every draw is an inverse CDF in our own arithmetic. torch.multinomial raises above 2^24 categories and was seen
 to be silently wrong at 2^24; a flat float64 CDF over 100 images of 800 x 800 costs 8 bytes a pixel and a cache
 miss at every step of its search. Three levels keep what a draw touches small: the superblocks' cumulative mass in
-float64, then within a superblock and within a block the children's cumulative shares as 31-bit integers, in which
+float64, then within a superblock and within a block the children's cumulative shares as 30-bit integers, in which
 search and probabilities are exact. Draws are with replacement. Tables and draws live on the CPU whatever the
 images' device (CUDA's cumulative sums need not be monotone), so that a seed draws the same pixels everywhere.
 """
@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 B = 32
-FULL = 2**31 - 1
-"""The integer that stands for a node's whole mass."""
+FULL = 2**30
+"""The integer that stands for a node's whole mass: two draws within a node fit into one 64-bit random number."""
 
 
 class UniformPixels:
@@ -65,17 +65,17 @@ class PixelTable:
     """Pixels of many images, each drawn in proportion to its strength (equation 5).
 
     Images are added once and stay; a draw names the ones it may choose from. 4 + 4/B + 8/B^2 bytes a pixel.
-    A pixel or block whose share of its parent is under 2^-32 may round to probability 0.
+    A pixel or block whose share of its parent is under 2^-31 may round to probability 0.
     """
 
     def __init__(self) -> None:
-        self._mass = torch.zeros(0, dtype=torch.float64)  # of superblocks, cumulative; slot s spans (s, s + 1]
-        self._blocks = torch.zeros((0, B), dtype=torch.int32)  # a superblock's blocks, cumulative shares
-        self._pixels = torch.zeros((0, B), dtype=torch.int32)  # a block's pixels, cumulative shares
-        self._shape = torch.zeros((0, 2), dtype=torch.int64)
-        self._first = torch.zeros(1, dtype=torch.int64)  # superblock at which an image begins, and the end of all
-        self._support = torch.zeros(0, dtype=torch.int64)
-        self._slot = torch.zeros(0, dtype=torch.int64)  # place in the cumulative mass; -1: no mass at all
+        self._mass = np.zeros(0)  # of superblocks, cumulative; slot s spans (s, s + 1]
+        self._blocks = np.zeros((0, B), dtype=np.int32)  # a superblock's blocks, cumulative shares
+        self._pixels = np.zeros((0, B), dtype=np.int32)  # a block's pixels, cumulative shares
+        self._shape = np.zeros((0, 2), dtype=np.int64)
+        self._first = np.zeros(1, dtype=np.int64)  # superblock at which an image begins, and the end of all
+        self._support = np.zeros(0, dtype=np.int64)
+        self._slot = np.zeros(0, dtype=np.int64)  # place in the cumulative mass; -1: no mass at all
 
     def __len__(self) -> int:
         return len(self._shape)
@@ -100,25 +100,25 @@ class PixelTable:
         filled = sum(place >= 0 for place in slot)
         for strength in strengths:
             share, block_mass = _level(_flat(strength))
-            pixels.append(share)
+            pixels.append(share.numpy())
             share, superblock_mass = _level(block_mass)
-            blocks.append(share)
-            total = torch.cumsum(superblock_mass, dim=0)
+            blocks.append(share.numpy())
+            total = np.cumsum(superblock_mass.numpy())
             support.append(int(torch.count_nonzero(strength)))
             slot.append(filled if support[-1] else -1)
-            mass.append(total / total[-1] + filled if support[-1] else torch.full_like(total, filled))
+            mass.append(total / total[-1] + filled if support[-1] else np.full_like(total, filled))
             filled += support[-1] > 0
-            shapes.append(strength.shape)
+            shapes.append(tuple(strength.shape))
         if not shapes:
             return
-        self._first = torch.cat((self._first, self._first[-1] + torch.tensor([len(m) for m in mass[1:]]).cumsum(0)))
-        self._mass, self._blocks, self._pixels = torch.cat(mass), torch.cat(blocks), torch.cat(pixels)
-        self._shape = torch.cat((self._shape, torch.tensor(shapes)))
-        self._slot, self._support = torch.tensor(slot), torch.tensor(support)
+        self._first = np.append(self._first, self._first[-1] + np.cumsum([len(m) for m in mass[1:]]))
+        self._mass, self._blocks, self._pixels = (np.concatenate(parts) for parts in (mass, blocks, pixels))
+        self._shape = np.concatenate((self._shape, shapes))
+        self._slot, self._support = np.array(slot), np.array(support)
 
     def drawable(self, images: Tensor) -> Tensor:
         """(k,) bool: the images that have a pixel of strength above 0."""
-        return self._slot[images] >= 0
+        return torch.from_numpy(self._slot[images.numpy()] >= 0)
 
     def draw(self, images: Tensor, n: int, rng: np.random.Generator) -> Tensor:
         """n draws with replacement.
@@ -130,30 +130,30 @@ class PixelTable:
             (n, 3) int64: position in `images`, row, column; ordered by image and superblock, so a part of the
             draw must be taken in strides, not from its beginning.
         """
-        u = rng.random((3, n))
-        u[0].sort()  # a search for ascending targets touches memory in order: 1/4 of the time of a draw
-        which = (u[0] * len(images)).astype(np.int64)
-        target = u[0] * len(images) - which
+        above, within = rng.bit_generator.random_raw(2 * n).reshape(2, n)
+        above.sort()  # a search for ascending targets touches memory in order: 1/4 of the time of a draw
+        target = (above >> 11) * 2.0**-53
         if len(images) == 1:  # a search within one image touches less memory
-            image = int(images[0])
-            first, slot, width = int(self._first[image]), float(self._slot[image]), int(self._shape[image, 1])
-            mass, base = self._mass[first : int(self._first[image + 1])], first
+            which, image = 0, int(images[0])
+            base, mass = int(self._first[image]), self._mass[self._first[image] : self._first[image + 1]]
         else:
-            image = images.numpy()[which]
-            first, slot, width = (v.numpy()[image] for v in (self._first, self._slot, self._shape[:, 1]))
-            mass, base = self._mass, 0
+            target *= len(images)
+            which = target.astype(np.int64)
+            target -= which
+            image, base, mass = images.numpy()[which], 0, self._mass
         # slot + u can round up to slot + 1, where the next image begins; so shrink u by more than that rounding
         target *= 1 - 2.0**-36
-        target += slot
-        node = torch.searchsorted(mass, torch.from_numpy(target), right=True).numpy()
+        target += self._slot[image]
+        node = torch.searchsorted(torch.from_numpy(mass), torch.from_numpy(target), right=True).numpy()
         node += base
-        for children, uniform in ((self._blocks, u[1]), (self._pixels, u[2])):
-            within = torch.from_numpy((uniform * FULL).astype(np.int32))[:, None]
-            child = torch.searchsorted(children.index_select(0, torch.from_numpy(node)), within, right=True)
-            node = node * B + child.numpy()[:, 0]
-        pixel = node - first * (B * B)
-        row = pixel // width
-        return torch.from_numpy(np.stack((which, row, pixel - row * width), axis=1))
+        node = _child(self._blocks, node, (within >> 34).astype(np.int32))
+        pixel = _child(self._pixels, node, (within >> 4).astype(np.int32) & (FULL - 1))
+        pixel -= self._first[image] * (B * B)
+        width = self._shape[image, 1]
+        drawn = np.empty((n, 3), dtype=np.int64)
+        drawn[:, 0] = which
+        np.divmod(pixel, width, out=(drawn[:, 1], drawn[:, 2]))
+        return torch.from_numpy(drawn)
 
     def probability(self, image: int) -> Tensor:
         """p of every pixel of one image as it is really drawn, (H, W) float64; sums to 1, or is all 0."""
@@ -161,20 +161,20 @@ class PixelTable:
         columns = torch.arange(height * width)
         drawn = torch.stack((torch.zeros_like(columns), columns // width, columns % width), dim=1)
         relative = self.relative(torch.tensor([image]), drawn).reshape(height, width)
-        return relative / self._support[image].clamp(min=1)
+        return relative / max(int(self._support[image]), 1)
 
     def relative(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) p of drawn pixels (as `draw` returns them) times the number of drawable pixels of their image."""
-        image = images[drawn[:, 0]]
-        node = drawn[:, 1] * self._shape[image, 1] + drawn[:, 2] + self._first[image] * B * B
-        p = self._support[image].double()
+        which, row, column = drawn.numpy().T
+        image = images.numpy()[which]
+        node = row * self._shape[image, 1] + column + self._first[image] * (B * B)
+        p = self._support[image].astype(np.float64)
         for children in (self._pixels, self._blocks):
-            node, child = torch.div(node, B, rounding_mode="floor"), (node % B)[:, None]
-            share = children.index_select(0, node)
-            below = torch.where(child > 0, share.gather(1, (child - 1).clamp(min=0)), 0)
-            p *= (share.gather(1, child) - below)[:, 0].double() / FULL
-        below = torch.where(node > self._first[image], self._mass[node - 1], self._slot[image].double())
-        return p * (self._mass[node] - below)
+            node, child = np.divmod(node, B)
+            below = np.where(child > 0, children[node, child - 1], 0)
+            p *= (children[node, child] - below) / FULL
+        below = np.where(node > self._first[image], self._mass[node - 1], self._slot[image])
+        return torch.from_numpy(p * (self._mass[node] - below))
 
 
 def in_threads(strength: Callable[[int], Tensor], images: Sequence[int], ahead: int = 16) -> Iterator[Tensor]:
@@ -203,3 +203,18 @@ def _level(child_mass: Tensor) -> tuple[Tensor, Tensor]:
     mass = cumulative[:, -1].clone()
     scale = FULL / mass.clamp(min=torch.finfo(torch.float64).tiny)
     return cumulative.mul_(scale[:, None]).round_().int(), mass
+
+
+def _child(cumulative: np.ndarray, node: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The children that targets in [0, FULL) fall into: (nodes, B) shares, (n,) nodes, (n,) -> (n,) numbers of
+    children, counted through all nodes.
+
+    A binary search in log2(B) gathers: copying the nodes' rows for torch.searchsorted takes twice the time.
+    """
+    shares = cumulative.reshape(-1)
+    child = node * B
+    half = B // 2
+    while half:
+        child += half * (shares.take(child + (half - 1)) <= target)
+        half //= 2
+    return child

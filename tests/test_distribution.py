@@ -14,7 +14,7 @@ from torch import Tensor
 from edge_se_sampler.distribution import FULL, B, PixelTable
 from edge_se_sampler.edges import edge_strength
 
-QUANTUM = 2**-30
+QUANTUM = 2 / FULL
 """Probabilities are exact to twice 1 / FULL: a share of the block, a share of the superblock."""
 
 
@@ -211,14 +211,16 @@ ENDS = [0.0, 2.0**-60, 1 / 3, 0.5, np.nextafter(0.5, 0), 0.75, 1 - 2.0**-36, np.
 
 
 class Given:
-    """A generator that answers given numbers."""
+    """A generator whose bits say given numbers: u[0] in 53 bits among images, u[1] and u[2] in 30 within nodes."""
 
-    def __init__(self, numbers: np.ndarray) -> None:
-        self.numbers = numbers
+    def __init__(self, u: np.ndarray) -> None:
+        among, block, pixel = ((u[row] * 2.0**bits).astype(np.uint64) for row, bits in enumerate((53, 30, 30)))
+        self.words = np.concatenate((among << 11, (block << 34) | (pixel << 4)))
+        self.bit_generator = self
 
-    def random(self, shape: tuple[int, ...]) -> np.ndarray:
-        assert shape == self.numbers.shape
-        return self.numbers.copy()
+    def random_raw(self, size: int) -> np.ndarray:
+        assert size == len(self.words)
+        return self.words.copy()
 
 
 def sparse(shape: tuple[int, int], *at: int) -> np.ndarray:
@@ -274,6 +276,7 @@ def test_the_ends_of_an_image_stay_in_it(images: int, order: str) -> None:
     first = np.arange(len(chosen)) / len(chosen)
     last = np.append(np.nextafter(first[1:], 0), np.nextafter(1, 0))
     numbers = np.sort(np.concatenate((first, last, np.nextafter(first, 1))))
+    numbers = np.floor(numbers * 2**53) / 2**53  # what 53 bits can say
     given = Given(np.stack((numbers, np.full_like(numbers, 0.9), np.full_like(numbers, 0.9))))
     drawn = table.draw(chosen, len(numbers), given)  # pyright: ignore[reportArgumentType]
     assert drawn[:, 0].tolist() == (numbers * len(chosen)).astype(int).tolist()
@@ -328,13 +331,13 @@ def test_relative_of_pixels_that_cannot_be_drawn_is_zero() -> None:
 
 
 def test_the_quantum_is_where_documented() -> None:
-    # a share under 2^-32 of its block rounds to nothing, one above 2^-31 never does
+    # a share under 2^-31 of its block rounds to nothing, one above 2^-30 never does
     strength = np.ones((1, 3))
     strength[0, 1] = 2.0**-34
     strength[0, 2] = 2.0**-29
     p = table_of(strength).probability(0)[0].tolist()
     assert p[1] == 0
-    assert p[2] * FULL == pytest.approx(4, abs=1e-6)
+    assert p[2] * FULL == pytest.approx(2, abs=1e-6)
 
 
 # ---- the table

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_se_sampler.distribution import PixelTable
+from edge_se_sampler.distribution import FULL, PixelTable
 
-QUANTUM = 2**-30
+QUANTUM = 2 / FULL
 
 
 @st.composite
