@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from edge_se_sampler.bench import demo
-from edge_se_sampler.data.made import make_scenes
-from edge_se_sampler.engine.config import MachineConfig
-from edge_se_sampler.engine.session import prepare
-from edge_se_sampler.methods import registered_methods
 
 ROOT = Path(__file__).parent.parent
 
@@ -54,20 +49,7 @@ def test_the_readme_quotes_the_committed_results():
 @pytest.mark.parametrize("method", demo.METHODS)
 def test_the_demo_comes_out_again(method: str, tmp_path: Path):
     """Its first 40 steps, on whatever machine this is: rounding grows with the steps, so the bound is loose."""
-    (scene,) = make_scenes(
-        tmp_path, [demo.SCENE], size=demo.SIZE, num_train=50, num_val=1, num_test=10, placement="shifted",
-        offset=demo.OFFSET,
-    )  # fmt: skip
-    config = registered_methods()[method].specification.config
-    trainer = prepare(
-        replace(
-            config,
-            data=scene,
-            output_dir=tmp_path / "runs",
-            max_num_iterations=demo.ITERATIONS,
-            machine=MachineConfig(seed=0, device_type="cpu"),
-        )
-    )
+    trainer = demo.demo_trainer(method, demo.make_demo_scene(tmp_path), tmp_path / "runs", seed=0)
     losses = [trainer.train_iteration(step) for step in range(41)]
     for line in result("demo/seed-0/demo.json")["methods"][method]["loss"][:5]:
         assert math.isclose(losses[line["step"]], line["loss"], rel_tol=0.02), line

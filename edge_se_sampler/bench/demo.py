@@ -18,6 +18,7 @@ from edge_se_sampler.engine.files import write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
+from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.show import require_pyplot, save_figure
 
@@ -52,14 +53,8 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
     workplace = output_dir / "demo"
     scene = workplace / f"{SCENE}-off-centre"
     if not scene.exists():
-        progress = Progress(50 + 1 + 10, f"making {scene.name}")
-        made = make_scenes(
-            workplace / "scenes-tmp", [SCENE], size=SIZE, num_train=50, num_val=1, num_test=10, placement="shifted",
-            offset=OFFSET, progress=lambda done, _: progress.update(done),
-        )  # fmt: skip
-        progress.close()
-        made[0].rename(scene)
-        made[0].parent.rmdir()
+        make_demo_scene(workplace / "scenes-tmp").rename(scene)
+        (workplace / "scenes-tmp").rmdir()
     outcomes = [_train(method, scene, workplace, seed) for method in METHODS]
     test, validation = pictures_of(read_blender(scene, "test")), pictures_of(read_blender(scene, "val"))
     background = float(np.mean([_background_psnr(picture) for picture in test]))
@@ -68,18 +63,33 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
     return outcomes
 
 
-def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
-    config = registered_methods()[method].specification.config
-    trainer = prepare(
+def make_demo_scene(folder: Path) -> Path:
+    """The demo's Blender folder, made in `folder`."""
+    progress = Progress(50 + 1 + 10, f"making {SCENE}, off centre")
+    (scene,) = make_scenes(
+        folder, [SCENE], size=SIZE, num_train=50, num_val=1, num_test=10, placement="shifted", offset=OFFSET,
+        progress=lambda done, _: progress.update(done),
+    )  # fmt: skip
+    progress.close()
+    return scene
+
+
+def demo_trainer(method: str, scene: Path, output_dir: Path, seed: int) -> Trainer:
+    """What trains one of the demo's methods, its run in output_dir."""
+    return prepare(
         replace(
-            config,
+            registered_methods()[method].specification.config,
             data=scene,
-            output_dir=workplace / "runs",
+            output_dir=output_dir,
             max_num_iterations=ITERATIONS,
             steps_per_eval_image=ITERATIONS // 20,
             machine=MachineConfig(seed=seed, device_type="cpu"),
         )
     )
+
+
+def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
+    trainer = demo_trainer(method, scene, workplace / "runs", seed)
     trainer.train()
     if trainer.stop_requested:
         raise KeyboardInterrupt
