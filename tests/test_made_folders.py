@@ -1,0 +1,230 @@
+"""Made scenes: honest folders, refusals, and nothing left behind."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from edge_se_sampler.data.made import ANALOG_OF, make_scenes, render_view
+from edge_se_sampler.data.made.cameras import FIELD_OF_VIEW, Placement, Split, framing, poses
+from edge_se_sampler.data.made.catalogue import made_scene
+from edge_se_sampler.data.made.render import render
+from edge_se_sampler.errors import InputError
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+OFFSET = (0.2, -0.15)
+
+
+def digest(*arrays: np.ndarray) -> str:
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
+def everything_below(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*"))
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in files}
+
+
+@pytest.mark.parametrize("placement", ["centered", "shifted", "rotated"])
+def test_folder_tells_the_truth(placement: Placement, tmp_path: Path) -> None:
+    """Every picture is what its json says, read as any loader of Blender scenes reads it."""
+    size = 24
+    made = make_scenes(
+        tmp_path, ["bricks"], size=size, num_train=2, num_val=0, num_test=1, placement=placement, offset=OFFSET, seed=3
+    )
+    assert made == [tmp_path / "bricks"]
+    assert sorted(everything_below(tmp_path)) == [
+        "bricks",
+        "bricks/test",
+        "bricks/test/r_0.png",
+        "bricks/train",
+        "bricks/train/r_0.png",
+        "bricks/train/r_1.png",
+        *(f"bricks/transforms_{split}.json" for split in ("test", "train", "val")),
+        "bricks/val",
+    ]
+    for split, count in (("train", 2), ("val", 0), ("test", 1)):
+        document = json.loads((tmp_path / "bricks" / f"transforms_{split}.json").read_text())
+        assert document["analog_of"] == "lego"
+        assert document["made_by"] == "edge_se_sampler"
+        assert ("cx" in document, "cy" in document) == (placement == "shifted",) * 2
+        assert (document["camera_angle_x"] == FIELD_OF_VIEW) == (placement == "centered")
+        assert [frame["file_path"] for frame in document["frames"]] == [f"./{split}/r_{i}" for i in range(count)]
+        for frame in document["frames"]:
+            picture = imageio.imread(tmp_path / "bricks" / f"{frame['file_path']}.png")
+            pose = np.array(frame["transform_matrix"])
+            assert isinstance(frame["rotation"], float)
+            assert pose.shape == (4, 4)
+            assert (picture.shape, picture.dtype) == ((size, size, 4), np.uint8)
+            focal = 0.5 * size / math.tan(0.5 * document["camera_angle_x"])
+            principal = (document.get("cx", size / 2), document.get("cy", size / 2))
+            np.testing.assert_array_equal(picture, render_view("bricks", pose, focal, principal, size, size))
+            assert picture[..., 3].max() == 255
+            assert not picture[picture[..., 3] == 0].any()
+
+
+def test_processes_make_the_same_pictures(tmp_path: Path) -> None:
+    """Six views and more go to other processes."""
+    heard: list[tuple[int, int]] = []
+    make_scenes(
+        tmp_path / "new" / "out",
+        ["mic", "chair"],
+        size=16,
+        num_train=3,
+        num_val=1,
+        num_test=2,
+        progress=lambda done, total: heard.append((done, total)),
+    )
+    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == ["chair", "mic"]
+    assert heard[-1] == (12, 12)
+    assert [done for done, _ in heard] == sorted({done for done, _ in heard})
+    assert len(heard) < 12
+    for name in ("mic", "chair"):
+        assert (
+            json.loads((tmp_path / f"new/out/{name}/transforms_val.json").read_text())["analog_of"] == ANALOG_OF[name]
+        )
+        for split, count in zip(SPLITS, (3, 1, 2), strict=True):
+            for index, pose in enumerate(poses(split, count)):
+                picture = imageio.imread(tmp_path / f"new/out/{name}/{split}/r_{index}.png")
+                np.testing.assert_array_equal(picture, render(made_scene(name), framing(16).camera(pose)))
+
+
+BAD_ARGUMENTS = [
+    pytest.param({"names": ["lego"]}, "'lego'.*mean 'bricks'", id="NeRF's name"),
+    pytest.param({"names": ["mic", "chiar"]}, "'chiar'.*mean 'chair'", id="typo"),
+    pytest.param({"names": []}, "names is empty", id="no name"),
+    pytest.param({"names": ["mic", "mic"]}, "names.*twice", id="twice"),
+    pytest.param({"size": 7}, "size is 7.*at least 8", id="size"),
+    pytest.param({"num_train": 0}, "num_train is 0.*at least 1", id="no train"),
+    pytest.param({"num_val": -1}, "num_val is -1.*at least 0", id="negative val"),
+    pytest.param({"num_test": -2}, "num_test is -2.*at least 0", id="negative test"),
+    pytest.param({"seed": -1}, "seed is -1", id="negative seed"),
+    pytest.param({"seed": 2**31}, "seed is 2147483648", id="large seed"),
+    pytest.param({"placement": "centred"}, "placement is 'centred'.*centered", id="placement"),
+    pytest.param({"placement": "shifted", "offset": (0.4, 0)}, "offset.*4 pixels.*8", id="offset"),
+    pytest.param({"placement": "rotated", "offset": (0, -0.6)}, "offset.*0 pixels.*8", id="offset off the image"),
+    pytest.param({"placement": "shifted", "offset": (math.nan, 0)}, "offset.*finite", id="offset nan"),
+    pytest.param(
+        {"names": ["hotdog"], "placement": "rotated", "offset": (0.3, 0.3)},
+        "offset turns hotdog out.*train/r_0",
+        id="clipped",
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_ARGUMENTS)
+def test_refusals_leave_nothing_behind(arguments: dict, message: str, tmp_path: Path) -> None:
+    good = {"names": ["mic"], "size": 20, "num_train": 1, "num_val": 0, "num_test": 0}
+    with pytest.raises(InputError, match=message) as refusal:
+        make_scenes(tmp_path / "deep" / "out", **{**good, **arguments})
+    assert "\n" not in str(refusal.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_scene_is_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "mic").mkdir()
+    (tmp_path / "mic" / "mine.txt").write_text("mine")
+    before = everything_below(tmp_path)
+    with pytest.raises(InputError, match="mic is there already"):
+        make_scenes(tmp_path, ["chair", "mic"], size=8, num_train=1, num_val=0, num_test=0)
+    assert everything_below(tmp_path) == before
+    make_scenes(tmp_path, ["chair"], size=8, num_train=1, num_val=0, num_test=0)
+    assert before.items() < everything_below(tmp_path).items()
+
+
+def test_an_empty_folder_is_filled(tmp_path: Path) -> None:
+    (tmp_path / "mic").mkdir()
+    make_scenes(tmp_path, ["mic"], size=8, num_train=1, num_val=0, num_test=0)
+    assert (tmp_path / "mic" / "train" / "r_0.png").is_file()
+
+
+def test_a_folder_filled_meanwhile_is_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "mic").mkdir()
+
+    def intrude(done: int, total: int) -> None:
+        (tmp_path / "mic" / "mine.txt").write_text("mine")
+
+    with pytest.raises(OSError):
+        make_scenes(tmp_path, ["mic"], size=8, num_train=1, num_val=0, num_test=0, progress=intrude)
+    assert everything_below(tmp_path) == {"mic": b"", "mic/mine.txt": b"mine"}
+
+
+@pytest.mark.parametrize("out", ["file", "file/below"])
+def test_out_that_is_a_file(out: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match=r"out is .*file.* not a folder"):
+        make_scenes(tmp_path / out, ["mic"], size=8, num_train=1, num_val=0, num_test=0)
+    assert everything_below(tmp_path) == {"file": b"mine"}
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="everything is writable to root")
+def test_out_that_is_not_writable(tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o500)
+    with pytest.raises(InputError, match="not writable"):
+        make_scenes(tmp_path / "locked" / "out", ["mic"], size=8, num_train=1, num_val=0, num_test=0)
+
+
+@pytest.mark.parametrize(
+    ("num_train", "error"),
+    [pytest.param(2, RuntimeError, id="here"), pytest.param(12, KeyboardInterrupt, id="in processes")],
+)
+def test_a_failure_leaves_nothing_behind(num_train: int, error: type[BaseException], tmp_path: Path) -> None:
+    def fail(done: int, total: int) -> None:
+        assert list((tmp_path / "deep" / "out").glob(".making-*/mic/train/*.png"))  # work was under way
+        raise error
+
+    with pytest.raises(error):
+        make_scenes(
+            tmp_path / "deep" / "out", ["mic"], size=8, num_train=num_train, num_val=0, num_test=0, progress=fail
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no process groups to interrupt")
+@pytest.mark.parametrize("moment", ["workers starting", "workers at work"])
+def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
+    """A terminal's Ctrl-C reaches every process of the group; only the first may answer."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pathlib import Path\n"
+        "from edge_se_sampler.data.made import make_scenes\n"
+        "if __name__ == '__main__':\n"
+        "    try:\n"
+        f"        make_scenes(Path({str(tmp_path / 'out')!r}), ['mic', 'ficus'], num_train=500,\n"
+        "                    progress=lambda done, total: print(done, flush=True))\n"
+        "    except KeyboardInterrupt:\n"
+        "        print('stopped')\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    with subprocess.Popen(
+        [sys.executable, str(script)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        if moment == "workers at work":
+            assert process.stdout.readline() == "5\n"
+        else:
+            while not list(tmp_path.glob("out/.making-*/ficus/*test.json")):  # the last thing before they are started
+                assert process.poll() is None
+                time.sleep(0.01)
+            time.sleep(0.15)
+        os.killpg(process.pid, signal.SIGINT)
+        said, complained = process.communicate(timeout=20)
+    assert said.splitlines()[-1] == "stopped"
+    assert complained == ""
+    assert process.returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
