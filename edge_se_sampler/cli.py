@@ -185,7 +185,7 @@ class Methods:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure: edge-se bench samplers, edge-se bench quality."""
+    """Measure: edge-se bench samplers, quality or nerfstudio."""
 
 
 @dataclass(frozen=True)
@@ -205,8 +205,10 @@ class BenchSamplers:
 
     def run(self) -> None:
         from edge_se_sampler.bench.samplers import bench_samplers, table_of
-        from edge_se_sampler.engine.files import write_json
+        from edge_se_sampler.engine.files import make_folder, write_json
 
+        if self.output_path is not None:
+            make_folder(self.output_path.parent, "--output-path, folder")
         if min(self.images, self.size, self.draws, self.repeats) < 1:
             raise InputError("--images, --size, --draws and --repeats must be at least 1")
         result = bench_samplers(self.images, self.size, self.draws, self.repeats)
@@ -241,6 +243,35 @@ class BenchQuality:
         print(f"{result['results']['psnr']:.2f} dB after {result['seconds']:.0f} s; see {self.output_dir}")
 
 
+@dataclass(frozen=True)
+class BenchNerfstudio:
+    """Count failures inside nerfstudio, with its own sampler and with ours; leave result.json. Resumes."""
+
+    output_dir: Path
+    """Where the result goes; runs that it already has are kept."""
+    workplace: Path = Path("bench")
+    """Where the scene and nerfstudio's runs are kept."""
+    scene: str = "chair"
+    """One of edge-se scenes."""
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Of weights, pixels and jitter."""
+    iterations: int = 1500
+    """Of every run."""
+    rays: int = 32
+    """Pixels a step."""
+    samples: int = 16
+    """Coarse samples a ray, and as many importance samples."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.nerfstudio import bench_nerfstudio
+
+        result = bench_nerfstudio(
+            self.output_dir, self.workplace, self.scene, self.seeds, self.iterations, self.rays, self.samples
+        )
+        for method, told in result["failures"].items():
+            print(f"{method}: {told['failed']} of {told['runs']} failed, {told['mean_psnr']:.2f} dB on average")
+
+
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "scenes": Scenes,
@@ -252,7 +283,7 @@ COMMANDS: dict[str, type] = {
     "methods": Methods,
     "bench": Bench,
 }
-BENCHES: dict[str, type] = {"samplers": BenchSamplers, "quality": BenchQuality}
+BENCHES: dict[str, type] = {"samplers": BenchSamplers, "quality": BenchQuality, "nerfstudio": BenchNerfstudio}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,56 +1,39 @@
-"""Gives a sampler the step and the model's squared errors: a mixin over any host's VanillaDataManager."""
+"""What squared-error sampling needs of a data manager, of any host: the model's errors on candidate pixels."""
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from edge_se_sampler.pixel_sampler import ImportantPixels
+from edge_se_sampler.pixel_sampler import ImportantPixels, SquaredError
+
+RayErrors = Callable[[Any, Any, dict[str, Tensor]], Tensor]
+"""Model, ray bundle (n rays), batch -> (n,) squared errors of the model's fine colours on the batch's pixels."""
 
 
-class SamplerHooks:
-    """Mixin: binds the training sampler to the pipeline's model when training begins.
+def scoring(
+    sampler: ImportantPixels, pipeline: Any, ray_generator: Callable[[Tensor], Any], ray_errors: RayErrors
+) -> SquaredError:
+    """How a sampler's candidates are scored: a training batch at a time, so that it takes no more memory than training.
 
-    A host's subclass says how a rendered ray is compared (`ray_errors`) and what a callback before an iteration
-    is there (`before_iteration`). The pipeline itself is not kept here: nerfstudio's data manager is a module,
-    and would count the model's weights as its own.
+    Args:
+        sampler: its number of rays, which hosts may change at any time, is the size of a batch.
+        pipeline: whose `model` is asked. It must not be kept on a data manager: nerfstudio's is a module, and would
+            count the model's weights as its own.
+        ray_generator: (n, 3) indices -> ray bundle.
+        ray_errors: how this host compares a rendered ray.
     """
 
-    train_pixel_sampler: Any
-    train_ray_generator: Any
-
-    def ray_errors(self, model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
-        """(n,) squared errors of the model's fine colours on the batch's pixels."""
-        raise NotImplementedError
-
-    def before_iteration(self, func: Any) -> Any:
-        """The host's callback that calls func(step=...) before every training iteration."""
-        raise NotImplementedError
-
-    def plan(self, trainer: Any) -> dict[str, int]:
-        """`planned_steps` and `seed` of the run, as ImportantPixels.bind takes them."""
-        return {"planned_steps": trainer.config.max_num_iterations, "seed": trainer.config.machine.seed}
-
-    def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
-        """The host's callbacks, and the one that tells the sampler the step."""
-        callbacks = super().get_training_callbacks(training_callback_attributes)  # type: ignore[misc]
-        sampler = self.train_pixel_sampler
-        if isinstance(sampler, ImportantPixels):
-            squared_error = partial(self.squared_error, training_callback_attributes.pipeline)
-            sampler.bind(squared_error=squared_error, **self.plan(training_callback_attributes.trainer))
-            callbacks.append(self.before_iteration(sampler.set_step))
-        return callbacks
-
     @torch.no_grad()
-    def squared_error(self, pipeline: Any, candidates: dict[str, Tensor]) -> Tensor:
-        """(m,) squared errors of candidate pixels, a training batch at a time: no more memory than training."""
-        count = len(candidates["indices"])
+    def squared_error(candidates: dict[str, Tensor]) -> Tensor:
         errors = []
-        for start in range(0, count, self.train_pixel_sampler.num_rays_per_batch):
-            rows = slice(start, start + self.train_pixel_sampler.num_rays_per_batch)
+        for start in range(0, len(candidates["indices"]), sampler.num_rays_per_batch):
+            rows = slice(start, start + sampler.num_rays_per_batch)
             batch = {key: candidates[key][rows] for key in ("indices", "image")}
-            errors.append(self.ray_errors(pipeline.model, self.train_ray_generator(batch["indices"]), batch))
+            errors.append(ray_errors(pipeline.model, ray_generator(batch["indices"]), batch))
         return torch.cat(errors)
+
+    return squared_error

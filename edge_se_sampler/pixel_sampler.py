@@ -58,28 +58,39 @@ class ImportantPixels:
         self._early_steps = 0.0
         self._seed = 0
         self._step = 0
+        self._rank, self._world = 0, 1
         self._tables: dict[str, _Tables] = {}
 
-    def bind(self, *, squared_error: SquaredError, planned_steps: int, seed: int) -> None:
+    def bind(
+        self, *, squared_error: SquaredError, planned_steps: int, seed: int, rank: int = 0, world: int = 1
+    ) -> None:
         """Follow a training run.
 
         Args:
             squared_error: scores candidates, see `SquaredError`.
             planned_steps: length of the run as first planned; resuming does not change it.
             seed: of the draws.
+            rank: of this process among `world` of a distributed run. Ranks that hold the same images take every
+                world-th row of one draw of world x N pixels (of candidates, of which each then keeps its own N).
         """
         self._squared_error = squared_error
         self._early_steps = self.config.early_length(planned_steps)
         self._seed = seed
+        self._rank, self._world = rank, world
 
     def set_step(self, step: int) -> None:
         """The step about to be trained; the phase and the draws depend on it alone."""
         self._step = step
 
     @property
+    def follows_training(self) -> bool:
+        """Whether it is bound to a run."""
+        return self._squared_error is not None
+
+    @property
     def strategy(self) -> str:
         """How the current step draws: "uniform", "precrop", "edge" or "se"."""
-        if self._squared_error is None:
+        if not self.follows_training:
             return "uniform"
         return self.config.early if phase_at(self._step, self._early_steps) == "early" else self.config.late
 
@@ -130,7 +141,7 @@ class ImportantPixels:
         """
         batch = ImageBatch.of(image_batch, use_mask=not self.config.ignore_mask)
         strategy, count = self.strategy, self.num_rays_per_batch
-        if self._squared_error is None:
+        if not self.follows_training:
             self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
         for over in set(self._tables) - {strategy, "uniform"}:
             del self._tables[over]  # the early phase is over: give its memory back
@@ -173,7 +184,8 @@ class ImportantPixels:
         source, places, drawable = self._drawable(batch, strategy)
         if self.config.images_per_step == "one":
             drawable = drawable[rng.integers(len(drawable), size=1)]
-        drawn = source.draw(places[drawable], count, rng)
+        # strided: a table's draws come ordered by image
+        drawn = source.draw(places[drawable], count * self._world, rng)[self._rank :: self._world]
         weight = None
         if self.config.importance_weight:
             relative = source.relative(places[drawable], drawn)
@@ -182,9 +194,11 @@ class ImportantPixels:
         return drawn, weight
 
     def _drawable(self, batch: ImageBatch, strategy: str) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
-        """What a strategy draws from, the images' places in it, and the positions that have a pixel to draw."""
+        """What a strategy draws from, the images' places in it, and the positions that have a pixel to draw, by
+        ascending image number: hosts collate images in any order, and a draw should not depend on it."""
         source, places = self.distribution(batch, strategy)
         drawable = torch.nonzero(source.drawable(places))[:, 0]
+        drawable = drawable[torch.argsort(batch.numbers.cpu()[drawable])]
         if not len(drawable):
             raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
         return source, places, drawable
@@ -198,7 +212,7 @@ class ImportantPixels:
             errors = self._squared_error(candidates)
         if errors.shape != (len(drawn),):
             raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
-        kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION))
+        kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION, self._rank))
         pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
         if self.config.importance_weight:
             share = count / len(drawn)  # what every candidate's inclusion would be without ranks

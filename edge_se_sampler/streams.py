@@ -1,8 +1,9 @@
 """Random numbers that need no state: every draw is a function of (seed, step, stream).
 
 Philox is counter-based (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the seed and the
-stream are its key, the step sits in the second word of its counter. Streams therefore never overlap (each step
-owns 2^64 blocks), a resumed run needs no saved generator, and the global generators are neither read nor moved.
+stream are its key, the step and the rank sit in the second and third words of its counter. Streams therefore never
+overlap (each step owns 2^64 blocks), a resumed run needs no saved generator, and the global generators are neither
+read nor moved.
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ class Stream(IntEnum):
     """Initial weights of the networks."""
 
 
-def stream(seed: int, step: int, purpose: Stream) -> np.random.Generator:
+def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Generator:
     """The generator of one purpose in one training step.
 
     Args:
         seed: any integer; taken modulo 2^64.
         step: >= 0.
+        rank: of a distributed run's process, where each needs numbers of its own.
     """
     key = np.array([seed % 2**64, int(purpose)], dtype=np.uint64)
-    counter = np.array([0, step, 0, 0], dtype=np.uint64)
+    counter = np.array([0, step, rank, 0], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=counter))

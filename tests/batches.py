@@ -69,11 +69,13 @@ def following(
     planned: int = 1000,
     seed: int = 0,
     squared_error: Any = brightness,
+    rank: int = 0,
+    world: int = 1,
     **settings: Any,
 ) -> EdgeSEPixelSampler:
     """A sampler bound to a run of `planned` steps, about to train `step`."""
     sampler = EdgeSEPixelSampler(EdgeSEPixelSamplerConfig(**settings), num_rays_per_batch=rays)
-    sampler.bind(squared_error=squared_error, planned_steps=planned, seed=seed)
+    sampler.bind(squared_error=squared_error, planned_steps=planned, seed=seed, rank=rank, world=world)
     sampler.set_step(step)
     return sampler
 

@@ -130,6 +130,27 @@ def test_an_output_folder_that_cannot_be_written(scene: Path, tmp_path: Path, ed
     assert "--output-dir" in line
 
 
+@pytest.mark.parametrize(
+    ("command", "flag", "path"),
+    [
+        (("demo",), "--output-dir", "file"),
+        (("bench", "quality"), "--output-dir", "file/below"),
+        (("bench", "samplers"), "--output-path", "file/result.json"),
+    ],
+)
+def test_results_that_could_not_be_kept_are_not_worked_for(command, flag: str, path: str, tmp_path: Path, edge_se):
+    (tmp_path / "file").write_text("in the way")
+    line = refused(edge_se, tmp_path, *command, flag, tmp_path / path)
+    assert flag in line
+    assert "cannot be made" in line
+
+
+def test_the_bench_inside_nerfstudio_needs_nerfstudio(tmp_path: Path, edge_se):
+    assert "needs all of nerfstudio" in refused(
+        edge_se, tmp_path, "bench", "nerfstudio", "--output-dir", tmp_path / "o"
+    )
+
+
 class TestRuns:
     def test_no_run(self, tmp_path: Path, edge_se):
         for command in ("eval", "render", "resume"):

@@ -162,25 +162,13 @@ def test_any_samplers_config_may_stand_in() -> None:
     assert sampler.num_rays_per_batch == 3
 
 
-def test_candidates_are_scored_as_the_model_errs() -> None:
-    """Batch by batch, by the fine colours, without gradients."""
-    manager, model = manager_of(rays=7), tiny_model().float().eval()
+def test_rays_err_as_the_model_errs() -> None:
+    """By the fine colours, against pixels composited on the background."""
+    manager, model = manager_of(rays=21), tiny_model().float().eval()
     follow(manager, 0)
-    _, batch = manager.next_train(0)
-    batch = {key: value.repeat(3, 1) for key, value in batch.items()}  # 21 candidates, 7 a time
-    calls = []
-    forward = model.forward
-    model.forward = lambda rays: (calls.append(len(rays)), forward(rays))[1]
-
-    @dataclass
-    class Bare:
-        model: Any
-
-    errors = manager.squared_error(Bare(model), batch)
-    assert calls == [7, 7, 7]
-    assert not errors.requires_grad
+    rays, batch = manager.next_train(0)
     with torch.no_grad():
-        shown = forward(manager.train_ray_generator(batch["indices"]))["rgb_fine"]
+        errors, shown = manager.ray_errors(model, rays, batch), model(rays)["rgb_fine"]
     color, alpha = batch["image"][:, :3], batch["image"][:, 3:]
     expected = ((shown - (color * alpha + 1 - alpha)) ** 2).sum(dim=1)
     torch.testing.assert_close(errors, expected, rtol=1e-4, atol=1e-6)

@@ -25,12 +25,13 @@ def philox(counter: list[int], key: list[int]) -> list[int]:
 @pytest.mark.parametrize("seed", [0, 7, 2**40, 2**64 + 7, -1])
 @pytest.mark.parametrize("step", [0, 1, 199_999])
 @pytest.mark.parametrize("purpose", Stream)
-def test_seed_and_purpose_are_the_key_and_the_step_the_second_counter_word(
-    seed: int, step: int, purpose: Stream
+@pytest.mark.parametrize("rank", [0, 3])
+def test_seed_and_purpose_are_the_key_step_and_rank_the_second_and_third_counter_words(
+    seed: int, step: int, purpose: Stream, rank: int
 ) -> None:
     # the first word counts blocks of four numbers; numpy counts before it generates
-    blocks = [philox([block, step, 0, 0], [seed % 2**64, int(purpose)]) for block in (1, 2)]
-    bits = stream(seed, step, purpose).bit_generator.random_raw(8)
+    blocks = [philox([block, step, rank, 0], [seed % 2**64, int(purpose)]) for block in (1, 2)]
+    bits = stream(seed, step, purpose, rank).bit_generator.random_raw(8)
     assert bits.tolist() == [number for block in blocks for number in block]
 
 

@@ -14,7 +14,7 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made.folder import make_scenes
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.evaluation import Picture, evaluate, pictures_of, psnr, target_image
-from edge_se_sampler.engine.files import write_json
+from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
@@ -49,6 +49,7 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
         InputError: output_dir cannot be written, or matplotlib is missing.
     """
     require_pyplot()
+    make_folder(output_dir, "--output-dir")
     began = time.monotonic()
     workplace = output_dir / "demo"
     scene = workplace / f"{SCENE}-off-centre"

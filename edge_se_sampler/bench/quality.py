@@ -10,7 +10,7 @@ from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.made.folder import make_scenes
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.evaluation import evaluate
-from edge_se_sampler.engine.files import write_json
+from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.methods import registered_methods
@@ -31,6 +31,7 @@ def bench_quality(
         InputError: a folder that cannot be written, an unknown scene, or matplotlib missing.
     """
     require_pyplot()
+    make_folder(output_dir, "--output-dir")
     data = workplace / "scenes" / scene
     if not data.exists():
         make_scenes(data.parent, [scene])

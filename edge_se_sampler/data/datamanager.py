@@ -12,13 +12,13 @@ from torch import Tensor
 from edge_se_sampler.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.datamanager import SamplerHooks
+from edge_se_sampler.datamanager import scoring
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.pixel_sampler import ImportantPixels
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
 
-class DataManager:
+class VanillaDataManager:
     """Holds the training images and asks a pixel sampler which of their pixels to train on.
 
     Args:
@@ -55,22 +55,24 @@ class DataManager:
         return self.train_ray_generator(batch["indices"]), batch
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
-        """None of its own."""
-        return []
-
-
-class VanillaDataManager(SamplerHooks, DataManager):
-    """The data manager of the standalone program."""
+        """Bind an important-pixel sampler to the run; the callback tells it the step."""
+        sampler, trainer = self.train_pixel_sampler, training_callback_attributes.trainer
+        if not isinstance(sampler, ImportantPixels):
+            return []
+        sampler.bind(
+            squared_error=scoring(
+                sampler, training_callback_attributes.pipeline, self.train_ray_generator, self.ray_errors
+            ),
+            planned_steps=trainer.planned_steps,
+            seed=trainer.config.machine.seed,
+        )
+        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
 
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
         """(n,) squared errors of the model's fine colours, in training mode."""
         image = unit_interval(batch["image"]).to(self.device)
         parts = [model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in model.chunks(len(ray_bundle))]
         return torch.cat(parts)
-
-    def before_iteration(self, func: Any) -> TrainingCallback:
-        """func(step=...) before every training iteration."""
-        return TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], func)
 
 
 def unit_interval(image: Tensor) -> Tensor:

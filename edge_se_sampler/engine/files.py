@@ -40,6 +40,24 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise InputError(f"{path}: cannot be written ({reason}); what was there before is untouched") from problem
 
 
+def make_folder(path: Path, flag: str) -> None:
+    """A folder that results will be written to, made before the work that it takes to have some.
+
+    Args:
+        flag: of the command line, which named it.
+
+    Raises:
+        InputError: it cannot be made, or not written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        writable = os.access(path, os.W_OK)
+    except OSError as problem:
+        raise InputError(f"{flag} {path}: cannot be made ({problem.strerror or problem})") from problem
+    if not writable:
+        raise InputError(f"{flag} {path}: cannot be written")
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write valid json (a NaN is an error, not a token).
 

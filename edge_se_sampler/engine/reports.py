@@ -16,7 +16,7 @@ from edge_se_sampler.engine.evaluation import (
     shade_behind,
     target_image,
 )
-from edge_se_sampler.engine.files import write_image, write_json
+from edge_se_sampler.engine.files import make_folder, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_views, test_pictures
@@ -35,10 +35,7 @@ def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) 
     config, model, checkpoint = load_model(RunFolder(run))
     pictures = test_pictures(config)
     if render_output_path is not None:
-        try:
-            render_output_path.mkdir(parents=True, exist_ok=True)
-        except OSError as problem:
-            raise InputError(f"--render-output-path {render_output_path}: {problem.strerror}") from problem
+        make_folder(render_output_path, "--render-output-path")
     progress = Progress(len(pictures), "evaluating")
 
     def each(i: int, picture: Picture, rendered: np.ndarray) -> None:

@@ -7,8 +7,9 @@ Imports no more of nerfstudio than its pixel samplers, so that the contract can 
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 
@@ -16,6 +17,10 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.pixel_sampler import ImportantPixels
 from edge_se_sampler.sampling_settings import SamplingSettings
 
+UNBOUND = (
+    "edge-se-sampler: this pixel sampler follows no training run and draws uniformly, as evaluation and export should; "
+    "to train with it, use EdgeSEDataManagerConfig or attach(trainer)"
+)
 INSTEAD = "take one of nerfstudio's own methods, whose sampler knows them"
 
 
@@ -45,3 +50,19 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
 
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
     """The same sampling as on our own protocol's base; the host contributes its config and its number of rays."""
+
+    def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
+        """As ImportantPixels.sample; a sampler that follows no training run says so, once, and draws uniformly."""
+        if not self.follows_training and not self._told:
+            self._told = True
+            print(UNBOUND, file=sys.stderr)
+        return super().sample(image_batch)
+
+    _told = False
+
+    def __getstate__(self) -> Any:
+        """Refuse to be sent to a worker process (nerfstudio's ParallelDataManager), where no model could be asked."""
+        raise InputError(
+            "a pixel sampler in a worker process knows neither step nor model, and would draw uniformly: set "
+            "config.pipeline.datamanager to an EdgeSEDataManagerConfig instead of a ParallelDataManagerConfig"
+        )

@@ -1,0 +1,222 @@
+"""`edge-se bench nerfstudio`: how often training dies inside nerfstudio, with its own sampler and with ours.
+
+Runs in an environment that has all of nerfstudio 1.1.5. Its vanilla NeRF has a softplus density, torch's initial
+weights and RAdam; the two methods differ in their data managers alone.
+"""
+# pyright: reportMissingImports=false
+# nerfstudio's pins rule out the environment that is linted
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import json
+import random
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from edge_se_sampler.bench.machine import machine, resident_memory
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.made.folder import make_scenes
+from edge_se_sampler.engine.evaluation import pictures_of, psnr, target_image
+from edge_se_sampler.engine.files import make_folder, write_json
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.errors import InputError
+
+METHODS = ("vanilla-nerf", "edge-se-nerf")
+SIZE, VIEWS, TEST_VIEWS = 64, 30, 3
+OFFSET = (0.2, 0.15)
+
+
+def bench_nerfstudio(
+    output_dir: Path, workplace: Path, scene: str, seeds: Sequence[int], iterations: int, rays: int, samples: int
+) -> dict[str, Any]:
+    """Train both methods with every seed and leave result.json; runs that it already has are kept.
+
+    Args:
+        output_dir: of the result.
+        workplace: where the scene and nerfstudio's runs are kept.
+        samples: coarse samples a ray, and as many importance samples.
+
+    Raises:
+        InputError: no nerfstudio here, a folder that cannot be written, an unknown scene, or a result of other
+            settings in output_dir.
+    """
+    if find_spec("nerfstudio") is None or find_spec("torchvision") is None:
+        raise InputError("bench nerfstudio needs all of nerfstudio 1.1.5 beside edge_se_sampler in one environment")
+    make_folder(output_dir, "--output-dir")
+    data = workplace / "scenes" / f"{scene}-off-centre-{SIZE}"
+    if not data.exists():
+        (made,) = make_scenes(
+            workplace / "scenes-tmp", [scene], size=SIZE, num_train=VIEWS, num_val=1, num_test=TEST_VIEWS,
+            placement="shifted", offset=OFFSET,
+        )  # fmt: skip
+        data.parent.mkdir(parents=True, exist_ok=True)
+        made.rename(data)
+    settings = {
+        "scene": {"name": scene, "placement": "shifted", "offset": OFFSET, "size": SIZE, "num_train": VIEWS},
+        "iterations": iterations,
+        "rays": rays,
+        "samples": [samples, samples],
+    }
+    path = output_dir / "result.json"
+    result = _begun(path, settings)
+    done = {(run["method"], run["seed"]) for run in result["runs"]}
+    missing = [(method, seed) for seed in seeds for method in METHODS if (method, seed) not in done]
+    progress = Progress(len(missing), "bench nerfstudio")
+    for i, (method, seed) in enumerate(missing):
+        with open(workplace / "nerfstudio.log", "a") as log, contextlib.redirect_stdout(log):
+            result["runs"].append(_run(method, seed, data, workplace / "runs", settings))
+        result["failures"] = _failures(result["runs"])
+        write_json(path, result)
+        progress.update(i + 1)
+    progress.close()
+    if "costs" not in result:
+        result["costs"] = costs(data, workplace / "runs", rays=256)
+        write_json(path, result)
+    return result
+
+
+def _begun(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """What an earlier call has left, if its settings were these."""
+    settings = json.loads(json.dumps(settings))
+    if not path.exists():
+        return {
+            "command": "edge-se bench nerfstudio",
+            "settings": settings,
+            "nerfstudio": version("nerfstudio"),
+            "machine": machine(),
+            "runs": [],
+        }
+    result = json.loads(path.read_text())
+    if result.get("settings") != settings:
+        raise InputError(f"{path}: is of other settings; name another --output-dir, or move it away")
+    return result
+
+
+def _config(method: str, seed: int, data: Path, runs: Path, rays: int) -> Any:
+    """A method's config on the scene."""
+    from nerfstudio.configs.method_configs import all_methods
+    from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+
+    config = copy.deepcopy(all_methods[method])
+    config.output_dir, config.vis, config.machine.seed = runs, "tensorboard", seed
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
+    manager = config.pipeline.datamanager
+    manager.data, manager.dataparser = data, BlenderDataParserConfig()
+    manager.train_num_rays_per_batch = rays
+    config.set_timestamp()
+    return config
+
+
+def _trainer(config: Any) -> Any:
+    """nerfstudio's trainer, seeded as ns-train seeds it."""
+    random.seed(config.machine.seed)
+    torch.manual_seed(config.machine.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup(test_mode="test")
+    return trainer
+
+
+def _run(method: str, seed: int, data: Path, runs: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Train once, and look at the test views."""
+    config = _config(method, seed, data, runs, settings["rays"])
+    config.max_num_iterations = settings["iterations"]
+    model = config.pipeline.model
+    model.num_coarse_samples, model.num_importance_samples = settings["samples"]
+    trainer = _trainer(config)
+    began, cpu = time.monotonic(), time.process_time()
+    trainer.train()
+    seconds, cpu = time.monotonic() - began, time.process_time() - cpu
+    return {"method": method, "seed": seed, "seconds": seconds, "cpu_seconds": cpu} | _looked_at(trainer, data)
+
+
+def _looked_at(trainer: Any, data: Path) -> dict[str, Any]:
+    """PSNR on the test views, and the error on the object as a share of what the background alone has there."""
+    pipeline = trainer.pipeline
+    pipeline.eval()
+    cameras = pipeline.datamanager.eval_dataset.cameras.to(pipeline.device)
+    own, background, shares = [], [], []
+    for i, picture in enumerate(pictures_of(read_blender(data, "test"))):
+        rendered = pipeline.model.get_outputs_for_camera(cameras[i : i + 1])["rgb_fine"].cpu().numpy()
+        target = target_image(picture, 1.0)
+        error, white = ((shown - target) ** 2 for shown in (rendered, np.ones_like(target)))
+        object_ = picture.image[..., 3] > 0
+        own.append(psnr(float(error.mean())))
+        background.append(psnr(float(white.mean())))
+        shares.append(float(error[object_].mean() / white[object_].mean()))
+    quality = statistics.mean(own)
+    floor = statistics.mean(background)
+    share = statistics.mean(shares)
+    # the rules of every stability claim here: no better than the background alone, or the object not learnt
+    return {
+        "psnr": quality,
+        "background_psnr": floor,
+        "foreground_share": share,
+        "failed": quality < floor + 0.5 or share > 0.9,
+    }
+
+
+_COST = "import sys; from edge_se_sampler.bench.nerfstudio import cost; cost(*sys.argv[1:])"
+
+
+def costs(data: Path, runs: Path, rays: int, rounds: int = 3) -> dict[str, Any]:
+    """Seconds a step (medians, interleaved) and peak memory of late sampling, uniform and by squared error."""
+    told: dict[str, list[dict[str, float]]] = {}
+    cases = [(method, late) for method in ("edge-se-nerf", "edge-se-nerfacto") for late in ("uniform", "se")]
+    for _ in range(rounds):
+        for case in cases:
+            command = [sys.executable, "-W", "ignore", "-c", _COST, *case, str(data), str(runs), str(rays)]
+            said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+            told.setdefault(" ".join(case), []).append(json.loads(said.splitlines()[-1]))
+    medians = {
+        case: {key: statistics.median(one[key] for one in several) for key in several[0]}
+        for case, several in told.items()
+    }
+    ratios = {
+        method: {key: medians[f"{method} se"][key] / value for key, value in medians[f"{method} uniform"].items()}
+        for method in ("edge-se-nerf", "edge-se-nerfacto")
+    }
+    return {"rays": rays, "medians": medians, "se_against_uniform": ratios}
+
+
+def cost(method: str, late: str, data: str, runs: str, rays: str) -> None:
+    """Print what a late step costs: seconds, and peak resident bytes above the level after set-up."""
+    config = _config(method, 0, Path(data), Path(runs), int(rays))
+    config.pipeline.datamanager.pixel_sampler.early = "uniform"
+    config.pipeline.datamanager.pixel_sampler.late = late
+    config.pipeline.datamanager.pixel_sampler.early_fraction = 0.0
+    trainer = _trainer(config)
+    before = resident_memory()
+    seconds = []
+    for step in range(8):
+        began = time.perf_counter()
+        for callback in trainer.callbacks:
+            callback.func(step=step)
+        trainer.train_iteration(step)
+        seconds.append(time.perf_counter() - began)
+    print(json.dumps({"seconds": statistics.median(seconds), "bytes": resident_memory("VmHWM") - before}))
+
+
+def _failures(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Failures out of runs for each method, and their mean PSNR."""
+    by_method = {method: [run for run in runs if run["method"] == method] for method in METHODS}
+    return {
+        method: {
+            "failed": sum(run["failed"] for run in mine),
+            "runs": len(mine),
+            "mean_psnr": statistics.mean(run["psnr"] for run in mine) if mine else None,
+        }
+        for method, mine in by_method.items()
+    }

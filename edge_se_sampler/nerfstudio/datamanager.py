@@ -1,0 +1,105 @@
+"""Important pixels in nerfstudio's data manager: ours by config, or any vanilla one by `attach`."""
+# pyright: reportMissingImports=false
+# nerfstudio's pins rule out the environment that is linted; here its classes count as unknown
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+from edge_se_sampler.datamanager import scoring
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
+from edge_se_sampler.nerfstudio.planned import planned_steps
+from edge_se_sampler.nerfstudio.scoring import ray_errors, shade_behind
+from edge_se_sampler.sampling_settings import SamplingSettings
+
+
+class EdgeSEDataManager(VanillaDataManager):
+    """nerfstudio's data manager, its training sampler bound to the run. Evaluation keeps nerfstudio's own sampler."""
+
+    def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
+        """The sampler of the training or the evaluation images; the config that both share stays as it is."""
+        shared = self.config.pixel_sampler
+        important = isinstance(shared, SamplingSettings)
+        if important and self.config.patch_size > 1:
+            raise InputError(f"patch-size is {self.config.patch_size}: important pixels are not drawn in patches")
+        evaluation = dataset is not self.train_dataset
+        self.config.pixel_sampler = _plain(shared) if important and evaluation else copy.copy(shared)
+        try:
+            return super()._get_pixel_sampler(dataset, num_rays_per_batch)
+        finally:
+            self.config.pixel_sampler = shared
+
+    def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
+        """nerfstudio's callbacks and ours; called once the checkpoint, if there is one, has been loaded."""
+        callbacks = super().get_training_callbacks(training_callback_attributes)
+        if isinstance(self.train_pixel_sampler, EdgeSEPixelSampler):
+            callbacks.append(_follow(self, training_callback_attributes.trainer))
+        return callbacks
+
+
+@dataclass
+class EdgeSEDataManagerConfig(VanillaDataManagerConfig):
+    """nerfstudio's data manager with important-pixel sampling; it suits any method whose model takes rays."""
+
+    _target: type = field(default_factory=lambda: EdgeSEDataManager)
+    pixel_sampler: EdgeSEPixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
+    """Which pixels are trained on."""
+
+
+def attach(trainer: Any, **settings: Any) -> None:
+    """Train a stock method on important pixels: after trainer.setup(), before trainer.train().
+
+    Args:
+        trainer: nerfstudio's, with a VanillaDataManager.
+        settings: fields of EdgeSEPixelSamplerConfig: early, late, edge_filter, ...
+
+    Raises:
+        InputError: another data manager, a sampler of a purpose of its own (patches, pairs), or settings or cameras
+            that have no meaning here.
+    """
+    manager = trainer.pipeline.datamanager
+    if not isinstance(manager, VanillaDataManager):
+        raise InputError(
+            f"{type(manager).__name__} does not draw its pixels in this process: important pixels need a "
+            "VanillaDataManager; set config.pipeline.datamanager to an EdgeSEDataManagerConfig instead of attaching"
+        )
+    sampler = manager.train_pixel_sampler
+    if type(sampler) is not PixelSampler:
+        raise InputError(f"the training sampler is a {type(sampler).__name__}: important pixels would not do its work")
+    config = EdgeSEPixelSamplerConfig(**(_known(sampler.config) | settings))
+    manager.train_pixel_sampler = config.setup(num_rays_per_batch=sampler.num_rays_per_batch)
+    trainer.callbacks.append(_follow(manager, trainer))
+
+
+def _follow(manager: Any, trainer: Any) -> TrainingCallback:
+    """Bind a data manager's training sampler to the run; the callback tells it the step."""
+    sampler, config = manager.train_pixel_sampler, trainer.config
+    sampler.background = shade_behind(trainer.pipeline.model)
+    sampler.bind(
+        squared_error=scoring(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
+        planned_steps=planned_steps(trainer),
+        seed=config.machine.seed,
+        rank=config.machine.machine_rank * config.machine.num_devices + trainer.local_rank,
+        world=trainer.world_size,
+    )
+    loader = manager.train_image_dataloader
+    if loader.cache_all_images:
+        sampler.check_images(loader.cached_collated_batch)
+    return TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)
+
+
+def _plain(shared: PixelSamplerConfig) -> PixelSamplerConfig:
+    """nerfstudio's own uniform sampler with the settings of ours that it knows."""
+    return PixelSamplerConfig(**_known(shared))
+
+
+def _known(config: PixelSamplerConfig) -> dict[str, Any]:
+    """The settings that nerfstudio's sampler and ours have in common."""
+    return {f.name: getattr(config, f.name) for f in fields(PixelSamplerConfig) if f.name != "_target"}

@@ -1,0 +1,73 @@
+"""The squared errors of nerfstudio's models on candidate pixels, found without a trace left in the model."""
+# pyright: reportMissingImports=false
+# nerfstudio's pins rule out the environment that is linted; here its classes count as unknown
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from edge_se_sampler.edges import WHITE
+from edge_se_sampler.errors import InputError
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
+    """(n,) squared errors of the model's fine colours, compared as its loss compares them.
+
+    Raises:
+        InputError: the model renders neither "rgb" nor "rgb_fine".
+    """
+    with _without_trace(model):
+        outputs = model(ray_bundle)
+        level = next((level for level in ("", "_fine") if f"rgb{level}" in outputs), None)
+        if level is None:
+            raise InputError(f"{type(model).__name__} renders neither rgb nor rgb_fine: late 'se' cannot score it")
+        colors = outputs[f"rgb{level}"]
+        image = batch["image"].to(colors.device)
+        if image.dtype == torch.uint8:
+            image = image.float() / 255
+        accumulation = outputs.get(f"accumulation{level}")
+        renderer: Any = getattr(model, "renderer_rgb", None)
+        if accumulation is not None and hasattr(renderer, "blend_background_for_loss_computation"):
+            colors, image = renderer.blend_background_for_loss_computation(
+                pred_image=colors, pred_accumulation=accumulation, gt_image=image
+            )
+        return (colors.float() - image[:, :3]).square().sum(dim=1)
+
+
+@contextmanager
+def _without_trace(model: nn.Module) -> Iterator[None]:
+    """Render as training does, pose corrections and all, and leave everything as it was.
+
+    The random numbers are others than the training pass will see, and the host's generators go on from where they
+    were. nerfacto's proposal sampler counts the steps since it last let gradients through; a forward pass that
+    resets the counter takes the next step's turn, and the proposal networks would never be trained again.
+    """
+    counters = [(m, m._steps_since_update) for m in model.modules() if hasattr(m, "_steps_since_update")]
+    was_training = model.training
+    model.train()
+    device: Any = getattr(model, "device", torch.device("cpu"))
+    try:
+        with torch.random.fork_rng([device] if torch.device(device).type == "cuda" else []):
+            torch.manual_seed(int(torch.randint(2**62, ())))
+            yield
+    finally:
+        model.train(was_training)
+        for module, count in counters:
+            module._steps_since_update = count
+
+
+def shade_behind(model: Any) -> tuple[float, float, float]:
+    """What the model's loss composites RGBA images on; a random background has no edge of its own, and counts as
+    white. Without alpha the data parser has composited them already, and this is of no account."""
+    background: Any = getattr(getattr(model, "renderer_rgb", None), "background_color", None)
+    if isinstance(background, Tensor):
+        red, green, blue = background.tolist()
+        return red, green, blue
+    return BLACK if background in ("black", "last_sample") else WHITE

@@ -1,0 +1,143 @@
+"""The whole host: phases follow the plan of the first run, and nothing of ours enters nerfstudio's state."""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytestmark = pytest.mark.nerfstudio_full
+pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio 1.1.5")
+
+import nerfstudio  # noqa: E402
+from full_host import PLANNED, RAYS, config_of, train, trainer_of, watch  # noqa: E402
+from nerfstudio.data.pixel_samplers import PixelSampler  # noqa: E402
+
+from edge_se_sampler.errors import InputError  # noqa: E402
+from edge_se_sampler.nerfstudio.planned import FILE  # noqa: E402
+
+
+def test_the_host_is_nerfstudio_itself() -> None:
+    assert "site-packages" in Path(nerfstudio.__file__ or "").parts
+
+
+def strategies(seen: list[tuple[int, str, torch.Tensor]]) -> list[tuple[int, str]]:
+    return [(step, strategy) for step, strategy, _ in seen]
+
+
+def resumed(config: Any, trained: Any, **changes: Any) -> Any:
+    again = copy.deepcopy(config)
+    again.load_dir = trained.checkpoint_dir
+    for key, value in changes.items():
+        setattr(again, key, value)
+    again.timestamp = "resumed"
+    return trainer_of(again)
+
+
+@pytest.mark.parametrize("name", ["edge-se-nerf", "edge-se-nerfacto"])
+def test_phases_switch_at_the_planned_step_also_after_resuming(name: str, host_scene: Path, tmp_path: Path) -> None:
+    config = config_of(name, host_scene, tmp_path, max_num_iterations=PLANNED)
+    trainer = trainer_of(config)
+    seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
+    trainer.train()
+    assert strategies(seen) == [(step, "edge" if step < PLANNED // 10 else "se") for step in range(PLANNED)]
+    assert all(indices.shape == (RAYS, 3) for *_, indices in seen)
+    # for 500 more: a tenth of those would be early
+    trainer = resumed(config, trainer, max_num_iterations=500)
+    seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
+    assert trainer.pipeline.datamanager.train_pixel_sampler._early_steps == PLANNED / 10
+    train(trainer, 3)
+    assert strategies(seen) == [(PLANNED + k, "se") for k in range(3)]
+    # and once more: the plan travels on
+    third = resumed(config, trainer, max_num_iterations=500, timestamp="third")
+    assert third.pipeline.datamanager.train_pixel_sampler._early_steps == PLANNED / 10
+
+
+def test_a_run_stopped_in_its_early_phase_goes_on_in_it(host_scene: Path, tmp_path: Path) -> None:
+    config = config_of("edge-se-nerf", host_scene, tmp_path, max_num_iterations=60)
+    trainer = trainer_of(config)
+    train(trainer, 4)
+    trainer = resumed(config, trainer, max_num_iterations=400)
+    seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
+    train(trainer, 4)
+    assert strategies(seen) == [(4, "edge"), (5, "edge"), (6, "se"), (7, "se")]
+
+
+def test_a_resumed_run_draws_what_the_uninterrupted_one_draws(host_scene: Path, tmp_path: Path) -> None:
+    def drawn(trainer: Any, steps: int) -> list[torch.Tensor]:
+        seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
+        train(trainer, steps)
+        return [indices for *_, indices in seen]
+
+    config = config_of("edge-nerf", host_scene, tmp_path, max_num_iterations=60)
+    expected = drawn(trainer_of(copy.deepcopy(config)), 8)
+    config.timestamp = "first"
+    first = trainer_of(copy.deepcopy(config))
+    drawn(first, 5)
+    for ours, theirs in zip(drawn(resumed(config, first), 3), expected[5:], strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_a_checkpoint_without_a_plan_is_told(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
+    config = config_of("edge-se-nerf", host_scene, tmp_path)
+    trainer = trainer_of(config)
+    train(trainer, 1)
+    (trainer.base_dir / FILE).unlink()
+    capfd.readouterr()
+    again = resumed(config, trainer, max_num_iterations=400)
+    assert again.pipeline.datamanager.train_pixel_sampler._early_steps == 40
+    assert f"no plan at {trainer.base_dir / FILE}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"planned_steps": "20"}', '{"planned_steps": 0}'])
+def test_what_is_no_plan_is_refused(content: str, host_scene: Path, tmp_path: Path) -> None:
+    config = config_of("edge-se-nerf", host_scene, tmp_path)
+    trainer = trainer_of(config)
+    train(trainer, 1)
+    (trainer.base_dir / FILE).write_text(content)
+    with pytest.raises(InputError, match=f"{FILE}: .*delete it to plan anew"):
+        resumed(config, trainer)
+
+
+def test_the_state_is_nerfstudios_alone(host_scene: Path, tmp_path: Path) -> None:
+    config = config_of("edge-se-nerf", host_scene, tmp_path)
+    trainer = trainer_of(config)
+    train(trainer, 4)
+    stock = trainer_of(config_of("vanilla-nerf", host_scene, tmp_path))
+    (checkpoint,) = trainer.checkpoint_dir.glob("*.ckpt")
+    saved = torch.load(checkpoint, weights_only=False)
+    assert set(saved["pipeline"]) == set(stock.pipeline.state_dict())
+    assert json.loads((trainer.base_dir / FILE).read_text()) == {"planned_steps": PLANNED}
+    manager = trainer.pipeline.datamanager
+    if isinstance(manager, torch.nn.Module):  # as in 1.1.5, no longer in its main branch
+        held = {type(module).__name__ for module in manager.modules()}
+        assert held == {"EdgeSEDataManager", "RayGenerator"}  # not the pipeline: its weights would be saved twice
+
+
+def test_evaluation_stays_nerfstudios_and_configs_stay_as_they_were(host_scene: Path, tmp_path: Path) -> None:
+    config = config_of("edge-se-nerf", host_scene, tmp_path)
+    before = copy.deepcopy(config.pipeline.datamanager.pixel_sampler)
+    trainer = trainer_of(config)
+    manager = trainer.pipeline.datamanager
+    assert type(manager.eval_pixel_sampler) is PixelSampler
+    assert manager.eval_pixel_sampler.num_rays_per_batch == RAYS
+    train(trainer, 4)
+    assert config.pipeline.datamanager.pixel_sampler == before
+    trainer.pipeline.get_eval_loss_dict(0)
+
+
+def test_the_host_may_change_the_number_of_rays_while_training(host_scene: Path, tmp_path: Path) -> None:
+    trainer = trainer_of(config_of("se-nerf", host_scene, tmp_path))
+    sampler = trainer.pipeline.datamanager.train_pixel_sampler
+    seen = watch(sampler)
+    sampler.set_step(10)
+    for rays in (7, 40, 5000):  # the last: more than the training images have pixels
+        sampler.set_num_rays_per_batch(rays)
+        trainer.train_iteration(10)
+    assert [len(indices) for *_, indices in seen] == [7, 40, 5000]
+    assert [strategy for _, strategy, _ in seen] == ["se"] * 3
