@@ -269,7 +269,10 @@ class BenchNerfstudio:
             self.output_dir, self.workplace, self.scene, self.seeds, self.iterations, self.rays, self.samples
         )
         for method, told in result["failures"].items():
-            print(f"{method}: {told['failed']} of {told['runs']} failed, {told['mean_psnr']:.2f} dB on average")
+            print(
+                f"{method}: {told['failed']} of {told['runs']} failed, {told['at_background']} at the background; "
+                f"{told['mean_psnr']:.2f} dB on average"
+            )
 
 
 COMMANDS: dict[str, type] = {
