@@ -58,6 +58,22 @@ class Cameras:
         """The same cameras on a device."""
         return Cameras(**{key: value.to(device) for key, value in vars(self).items()})
 
+    def between(self, first: int, second: int, share: float) -> Cameras:
+        """One camera on the way from one to another, with the first one's lens and size.
+
+        It turns at an even rate, and the world's origin moves evenly in its view: between cameras that look at one
+        point it looks there too.
+
+        Args:
+            share: of the way, in [0, 1].
+        """
+        a, b = self.camera_to_worlds[first].double(), self.camera_to_worlds[second].double()
+        rotation = a[:, :3] @ rotation_power(a[:, :3].T @ b[:, :3], share)
+        seen = torch.lerp(a[:, :3].T @ a[:, 3], b[:, :3].T @ b[:, 3], share)
+        pose = torch.cat((rotation, (rotation @ seen)[:, None]), dim=1).to(self.camera_to_worlds)
+        lens = {key: value[first : first + 1] for key, value in vars(self).items() if key != "camera_to_worlds"}
+        return Cameras(camera_to_worlds=pose[None], **lens)
+
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
         """One ray for each coordinate.
 
@@ -73,6 +89,17 @@ class Cameras:
         directions = (pose[:, :, :3] @ in_camera[:, :, None])[:, :, 0]
         norm = directions.norm(dim=1, keepdim=True)
         return RayBundle(pose[:, :, 3], directions / norm, camera_indices, {"directions_norm": norm})
+
+
+def rotation_power(rotation: Tensor, share: float) -> Tensor:
+    """A share of a rotation's angle about its axis, (3, 3) -> (3, 3) float64; of half a turn, in either sense."""
+    rotation = rotation.double()
+    axis = torch.linalg.eigh((rotation + rotation.T) / 2).eigenvectors[:, 2]  # of the eigenvalue 1, the largest
+    x, y, z = axis.tolist()
+    skew = rotation.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sine = (skew * rotation).sum() / 2  # the trace is 1 + 2 cos, the skew part the axis times sin
+    angle = share * torch.atan2(sine, (rotation.trace() - 1) / 2)
+    return torch.eye(3).to(rotation) + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
 
 
 class RayGenerator:

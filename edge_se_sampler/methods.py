@@ -1,4 +1,4 @@
-"""The named methods: the paper's six strategies, and whatever other packages register. Torch-free.
+"""The named methods: the paper's six strategies on NeRF, two on InfoNeRF, and whatever others register. Torch-free.
 
 A package adds a method with an entry point of the group edge_se_sampler.method_configs that names a
 `protocol.MethodSpecification`.
@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.engine.config import PipelineConfig, TrainerConfig
+from edge_se_sampler.nerf.config import InfoNeRFModelConfig, NeRFModelConfig
 from edge_se_sampler.protocol import MethodSpecification
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 
@@ -28,11 +29,20 @@ STRATEGIES = {
 """Name -> early, late, description: table 1 of the paper."""
 
 
-def _strategy(name: str) -> MethodSpecification:
-    early, late, description = STRATEGIES[name]
+INFO_NERF = {
+    "info-nerf": ("vanilla-nerf", "InfoNeRF: NeRF from few views (--num-views), unseen rays kept unambiguous"),
+    "edge-se-info-nerf": ("edge-se-nerf", "Edge + SE on InfoNeRF"),
+}
+"""Name -> strategy, description: the paper's other method. The other strategies by flag."""
+
+
+def _specification(name: str) -> MethodSpecification:
+    model: NeRFModelConfig = InfoNeRFModelConfig() if name in INFO_NERF else NeRFModelConfig()
+    strategy, description = INFO_NERF.get(name, (name, ""))
+    early, late, of_strategy = STRATEGIES[strategy]
     sampler = EdgeSEPixelSamplerConfig(early=early, late=late)  # pyright: ignore[reportArgumentType]
-    pipeline = PipelineConfig(datamanager=VanillaDataManagerConfig(pixel_sampler=sampler))
-    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description)
+    pipeline = PipelineConfig(datamanager=VanillaDataManagerConfig(pixel_sampler=sampler), model=model)
+    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description or of_strategy)
 
 
 @dataclass(frozen=True)
@@ -49,7 +59,7 @@ def registered_methods() -> dict[str, RegisteredMethod]:
     An entry point that fails to load, is no MethodSpecification or takes a name that exists is left out with
     one line on stderr; it must not keep the others from working.
     """
-    methods = {name: RegisteredMethod(_strategy(name), "edge_se_sampler") for name in STRATEGIES}
+    methods = {name: RegisteredMethod(_specification(name), "edge_se_sampler") for name in (*STRATEGIES, *INFO_NERF)}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
         origin = entry.dist.name if entry.dist else entry.value
         try:

@@ -24,6 +24,8 @@ class Stream(IntEnum):
     """Jitter along the rays, density noise, random backgrounds."""
     WEIGHTS = 4
     """Initial weights of the networks."""
+    UNSEEN = 5
+    """Poses and pixels of rays without an image."""
 
 
 def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Generator:

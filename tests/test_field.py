@@ -165,7 +165,7 @@ def test_xavier_bounds_and_zero_biases() -> None:
 
 def test_torchs_default_bounds() -> None:
     """Weight and bias uniform in +-1 / sqrt(in), as nn.Linear's own."""
-    config = resolved(NeRFModelConfig(initialization="torch"), "paper")
+    config = resolved(NeRFModelConfig(initialization="torch"), "paper", 1024)
     for layer in linear_layers(NeRFField(config, np.random.default_rng(0))):
         bound = 1 / math.sqrt(layer.in_features)
         check_uniform(layer.weight, bound)

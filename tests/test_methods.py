@@ -13,7 +13,7 @@ from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 
 
-def test_the_six_strategies_of_the_paper():
+def test_the_six_strategies_of_the_paper_and_two_on_its_other_method():
     samplers = {
         name: method.specification.config.pipeline.datamanager.pixel_sampler
         for name, method in registered_methods().items()
@@ -26,6 +26,8 @@ def test_the_six_strategies_of_the_paper():
         "precrop-se-nerf": ("precrop", "se"),
         "edge-nerf": ("edge", "uniform"),
         "edge-se-nerf": ("edge", "se"),
+        "info-nerf": ("uniform", "uniform"),
+        "edge-se-info-nerf": ("edge", "se"),
     }
     assert {name: (getattr(s, "early", ""), getattr(s, "late", "")) for name, s in samplers.items()} == table
     for sampler in samplers.values():  # faithful to the paper, for ever

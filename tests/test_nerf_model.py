@@ -24,7 +24,7 @@ def pixels(channels: int = 4, seed: int = 0) -> Tensor:
 
 
 def rendered(model: NeRFModel, seed: int = 3, rays: RayBundle | None = None) -> dict[str, Tensor]:
-    model.reseed(seed)
+    model.begin_step(0, seed)
     return model(tiny_rays(RAYS) if rays is None else rays)
 
 

@@ -41,6 +41,7 @@ def test_purposes_never_change_their_number() -> None:
         "SELECTION": 2,
         "MODEL": 3,
         "WEIGHTS": 4,
+        "UNSEEN": 5,
     }
 
 

@@ -79,7 +79,7 @@ def test_the_loss_is_the_mean_over_rays_and_weights() -> None:
     before = {key: value.clone() for key, value in model.state_dict().items()}
     loss = trainer.train_iteration(0)
     model.load_state_dict(before)
-    model.reseed(model.random.initial_seed())
+    model.begin_step(0, model.random.initial_seed())
     rays, batch = batches[0]
     with torch.no_grad():
         outputs = model(rays)

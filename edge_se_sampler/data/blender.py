@@ -44,6 +44,16 @@ class Views:
     focal: np.ndarray  # (n, 2) float64: fx, fy in pixels
     principal: np.ndarray  # (n, 2) float64: cx, cy in pixels; pixel centres lie at +0.5
 
+    def subset(self, numbers: Sequence[int]) -> Views:
+        """The views of these numbers, in this order."""
+        chosen = list(numbers)
+        return Views(
+            tuple(self.names[i] for i in chosen),
+            tuple(self.images[i] for i in chosen),
+            None if self.masks is None else tuple(self.masks[i] for i in chosen),
+            *(values[chosen] for values in (self.camera_to_worlds, self.focal, self.principal)),
+        )
+
 
 @dataclass(frozen=True)
 class _Setting:

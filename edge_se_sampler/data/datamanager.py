@@ -54,6 +54,15 @@ class VanillaDataManager:
         batch |= {key: value.to(self.device) for key, value in batch.items() if key != "full_image"}
         return self.train_ray_generator(batch["indices"]), batch
 
+    def unseen_rays(self, n: int, rng: np.random.Generator) -> RayBundle:
+        """n rays, uniform in the image of a camera somewhere between two training cameras."""
+        cameras = self.train_ray_generator.cameras
+        first, second = rng.choice(len(cameras), size=2, replace=len(cameras) < 2).tolist()
+        camera = cameras.between(first, second, rng.random())
+        size = torch.cat((camera.height[0], camera.width[0])).cpu()
+        pixels = torch.from_numpy(rng.random((n, 2)) * size.numpy()).long()
+        return RayGenerator(camera)(torch.cat((torch.zeros((n, 1), dtype=torch.int64), pixels), dim=1))
+
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
         """Bind an important-pixel sampler to the run; the callback tells it the step."""
         sampler, trainer = self.train_pixel_sampler, training_callback_attributes.trainer

@@ -53,6 +53,10 @@ class TrainerConfig(InstantiateConfig):
     """Name of the method, part of the run folder's path."""
     data: Path | None = None
     """The Blender folder (transforms_train.json and so on) to train on."""
+    num_views: int | None = None
+    """Train on this many of the views, picked as InfoNeRF's code picks them; left out, on all."""
+    views: tuple[int, ...] | None = None
+    """Numbers of the views to train on, from 0; instead of --num-views."""
     output_dir: Path = Path("outputs")
     """Runs land in OUTPUT_DIR/EXPERIMENT/METHOD/TIMESTAMP."""
     experiment_name: str | None = None

@@ -7,7 +7,7 @@ from dataclasses import replace
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf.config import SIZES, resolved, size_for
+from edge_se_sampler.nerf.config import SIZES, InfoNeRFModelConfig, resolved, size_for
 
 
 def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
@@ -32,7 +32,7 @@ def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
         pipeline=replace(
             config.pipeline,
             datamanager=replace(manager, train_num_rays_per_batch=rays),
-            model=resolved(model, size),
+            model=resolved(model, size, rays),
         ),
         optimizer=replace(
             config.optimizer, lr=preset.learning_rate if config.optimizer.lr is None else config.optimizer.lr
@@ -69,6 +69,8 @@ def _check(plan: TrainerConfig) -> None:
         raise InputError(f"--pipeline.model.near is {model.near}, --pipeline.model.far {model.far}: 0 <= near < far")
     if not 0 <= model.density_noise < float("inf"):
         raise InputError(f"--pipeline.model.density-noise is {model.density_noise}: must be at least 0")
+    if isinstance(model, InfoNeRFModelConfig):
+        _check_info(model)
     if plan.max_seconds is not None and not plan.max_seconds > 0:
         raise InputError(f"--max-seconds is {plan.max_seconds}: must be above 0")
     if not 0 < (plan.optimizer.lr or 0) < float("inf"):
@@ -80,3 +82,20 @@ def _check(plan: TrainerConfig) -> None:
     for name in (plan.method_name, plan.experiment_name):
         if name in (None, "", ".", "..") or "/" in str(name) or "\0" in str(name):
             raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
+
+
+def _check_info(model: InfoNeRFModelConfig) -> None:
+    at_least_zero = {
+        "num-unseen-rays": model.num_unseen_rays or 0,
+        "entropy-weight": model.entropy_weight,
+        "gain-weight": model.gain_weight,
+        "gain-degrees": model.gain_degrees,
+        "gain-rate": model.gain_rate,
+    }
+    for flag, value in at_least_zero.items():
+        if not 0 <= value < float("inf"):
+            raise InputError(f"--pipeline.model.{flag} is {value}: must be at least 0")
+    if not 0 <= model.entropy_threshold < 1:
+        raise InputError(f"--pipeline.model.entropy-threshold is {model.entropy_threshold}: must be in [0, 1)")
+    if model.gain_steps < 1:
+        raise InputError(f"--pipeline.model.gain-steps is {model.gain_steps}: must be at least 1")

@@ -8,6 +8,8 @@ import dataclasses
 import math
 from pathlib import Path
 
+import numpy as np
+
 from edge_se_sampler.data.blender import Views, has_split, read_blender
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
@@ -81,14 +83,39 @@ def test_pictures(config: TrainerConfig) -> list[Picture]:
 
 
 def read_views(config: TrainerConfig) -> Views:
-    """The training views of a config's data.
+    """The training views of a config's data: all, or the few that it chooses.
 
     Raises:
-        InputError: no data given, or bad data.
+        InputError: no data given, bad data, or a choice of views that cannot be.
     """
     if config.data is None:
         raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
-    return read_blender(config.data, "train")
+    views = read_blender(config.data, "train")
+    chosen = chosen_views(config, len(views.names))
+    return views if chosen is None else views.subset(chosen)
+
+
+def chosen_views(config: TrainerConfig, count: int) -> list[int] | None:
+    """Numbers of the views to train on; None: all `count` of them.
+
+    --num-views picks as InfoNeRF's public code does, numpy.random.RandomState(0).permutation(count)[:k].
+
+    Raises:
+        InputError: both choices at once, more views than there are, a number twice or out of range.
+    """
+    if config.num_views is not None:
+        if config.views is not None:
+            raise InputError("--num-views and --views: give one of them")
+        if not 1 <= config.num_views <= count:
+            raise InputError(f"--num-views is {config.num_views}: must be between 1 and {count}, the training views")
+        return np.random.RandomState(0).permutation(count)[: config.num_views].tolist()
+    if config.views is None:
+        return None
+    if not config.views or len(set(config.views)) < len(config.views):
+        raise InputError(f"--views is {config.views}: name each view once, at least one")
+    if not all(0 <= number < count for number in config.views):
+        raise InputError(f"--views is {config.views}: the training views are numbered 0 to {count - 1}")
+    return list(config.views)
 
 
 def summary(config: TrainerConfig, run: RunFolder) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -95,18 +95,18 @@ class Trainer:
         model.train()
         for callback in self.callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        model.reseed(int(stream(self.config.machine.seed, step, Stream.MODEL).integers(2**63)))
+        seed = self.config.machine.seed
+        model.begin_step(step, int(stream(seed, step, Stream.MODEL).integers(2**63)))
         rays, batch = self.pipeline.datamanager.next_train(step)
         self.optimizer.zero_grad(set_to_none=False)
         batch.pop("full_image", None)  # not of these rays alone
-        loss = torch.zeros((), device=model.device)
-        for rows in model.chunks(len(rays)):
-            part = model.loss(
-                model(rays[rows]), {key: value[rows] for key, value in batch.items() if key != "full_image"}
-            )
-            part = part.sum() / len(rays)
-            part.backward()
-            loss += part.detach()
+        loss = self._backward(
+            len(rays), lambda rows: model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
+        )
+        if model.num_unseen_rays:
+            rng = stream(seed, step, Stream.UNSEEN)
+            unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, rng)
+            loss += self._backward(len(unseen), lambda rows: model.unseen_loss(unseen[rows]))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(step)
         value = float(loss)
@@ -116,6 +116,15 @@ class Trainer:
         for callback in self.callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return value
+
+    def _backward(self, rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
+        """Add the gradients of a loss's mean over rays, as many rays at a time as are worth rendering; that mean."""
+        loss = torch.zeros((), device=self.pipeline.model.device)
+        for rows in self.pipeline.model.chunks(rays):
+            part = loss_of(rows).sum() / rays
+            part.backward()
+            loss += part.detach()
+        return loss
 
     def learning_rate(self, step: int) -> float:
         """lr * final_fraction^(step / planned steps)."""

@@ -43,6 +43,29 @@ class NeRFModelConfig(InstantiateConfig):
 
 
 @dataclass(frozen=True)
+class InfoNeRFModelConfig(NeRFModelConfig):
+    """NeRF with InfoNeRF's losses on rays of poses between the training views, for few of them."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.nerf.info:InfoNeRFModel"
+
+    num_unseen_rays: int | None = None
+    """Unseen rays of a step; left out, as many as it trains on (its code: 1024 and 1024)."""
+    entropy_weight: float = 0.001
+    """Of the rays' entropy, in bits."""
+    entropy_threshold: float = 0.1
+    """Accumulation above which a ray counts as one that hits."""
+    gain_weight: float = 0.0
+    """Of the information gain, which renders every ray twice. Its code ships with 0 for Blender scenes and 2e-5 for
+    DTU; at 1 training does not converge."""
+    gain_degrees: float = 5.0
+    """Rays are turned by up to this about each axis."""
+    gain_rate: float = 0.5
+    """What the weight is multiplied with every gain_steps."""
+    gain_steps: int = 5000
+    """Iterations between two such decays."""
+
+
+@dataclass(frozen=True)
 class SizePreset:
     """One size: the model, and a plan of training that suits it."""
 
@@ -68,8 +91,10 @@ def size_for(pixels_a_side: int) -> str:
     return "small" if pixels_a_side <= 256 else "paper"
 
 
-def resolved(config: NeRFModelConfig, size: str) -> NeRFModelConfig:
-    """The config with every None replaced by the size's value."""
+def resolved(config: NeRFModelConfig, size: str, rays: int) -> NeRFModelConfig:
+    """The config with every None replaced by the size's value, or by a step's number of rays."""
     preset = SIZES[size].model
+    if isinstance(config, InfoNeRFModelConfig) and config.num_unseen_rays is None:
+        config = replace(config, num_unseen_rays=rays)
     chosen = {key: getattr(preset, key) if value is None else value for key, value in vars(config).items()}
     return replace(config, **chosen | {"size": size})

@@ -48,8 +48,8 @@ class NeRFModel(nn.Module):
         size = max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points)
         return (slice(start, start + size) for start in range(0, rays, size))
 
-    def reseed(self, seed: int) -> None:
-        """Make the randomness of what follows a function of the seed."""
+    def begin_step(self, step: int, seed: int) -> None:
+        """Make the randomness of what follows a function of the seed, in a training step (0, 1, 2, ...)."""
         if self.random.device != self.device:
             self.random = torch.Generator(self.device)
         self.random.manual_seed(seed)
@@ -59,7 +59,8 @@ class NeRFModel(nn.Module):
 
         Returns:
             rgb_coarse, rgb_fine (n, 3); accumulation_coarse, accumulation_fine (n, 1); depth_fine (n, 1) in
-            world units along the ray; background (n, 3) behind each ray.
+            world units along the ray; background (n, 3) behind each ray; density_fine, delta_fine (n, s) of the
+            fine network's samples.
         """
         config, count = self.config, len(rays)
         samples = config.num_coarse_samples or 0
@@ -67,14 +68,15 @@ class NeRFModel(nn.Module):
         jitter = self._uniform(count, samples) if self.training else None
         t = stratified(config.near * norm, config.far * norm, samples, jitter)
         background = self._background(count)
-        weights, rgb = self._render(self.coarse, rays, t, background)
+        weights, rgb, _ = self._render(self.coarse, rays, t, background)
         outputs = {"rgb_coarse": rgb, "accumulation_coarse": weights.sum(1, keepdim=True), "background": background}
 
         t = torch.sort(torch.cat((t, self._importance(t, weights.detach())), dim=1)).values
-        weights, rgb = self._render(self.fine, rays, t, background)
+        weights, rgb, samples = self._render(self.fine, rays, t, background)
         accumulation = weights.sum(1, keepdim=True)
         depth = (weights * t).sum(1, keepdim=True) + (1 - accumulation) * t[:, -1:]
-        return outputs | {"rgb_fine": rgb, "accumulation_fine": accumulation, "depth_fine": depth}
+        fine = {"rgb_fine": rgb, "accumulation_fine": accumulation, "depth_fine": depth}
+        return outputs | fine | dict(zip(("density_fine", "delta_fine"), samples, strict=True))
 
     def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
         """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.
@@ -84,8 +86,19 @@ class NeRFModel(nn.Module):
         """
         return (outputs[f"rgb_{level}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
+    num_unseen_rays = 0
+    """Rays of poses without an image that a training step wants besides its batch; see `unseen_loss`."""
+
+    def unseen_loss(self, rays: RayBundle) -> Tensor:
+        """(n,) what training minimises the mean of on rays of a pose without an image; here nothing asks for them."""
+        raise NotImplementedError
+
+    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> Tensor:
+        """(n,) what training minimises the mean of on a batch's rays."""
+        return self.loss(self(rays), batch)
+
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-        """(n,) what training minimises the mean of: coarse + fine error, a mean over channels as in NeRF's code."""
+        """(n,) coarse + fine error of every ray, a mean over channels as in NeRF's code, times its weight if any."""
         image = batch["image"]
         error = self.squared_error(outputs, image, "coarse") + self.squared_error(outputs, image, "fine")
         return error * batch["weight"] / 3 if "weight" in batch else error / 3
@@ -98,8 +111,10 @@ class NeRFModel(nn.Module):
             uniform = torch.linspace(0, 1, count, dtype=t.dtype, device=t.device).expand(len(t), count)
         return importance((t[:, 1:] + t[:, :-1]) / 2, weights[:, 1:-1], uniform)
 
-    def _render(self, field: NeRFField, rays: RayBundle, t: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights (n, s) and colours (n, 3) of rays sampled at t (n, s)."""
+    def _render(
+        self, field: NeRFField, rays: RayBundle, t: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+        """Weights (n, s) and colours (n, 3) of rays sampled at t (n, s), and density and interval of each sample."""
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
         noise = self._noise(t.numel())
         if self.occupied is None:
@@ -113,8 +128,9 @@ class NeRFModel(nn.Module):
             color = t.new_zeros((t.numel(), 3)).index_put((packed,), some_color)
         # a softplus is never 0: over an endless interval it would hide every background
         delta = intervals(t, endless=self.config.density_activation == "relu")
-        weights = sample_weights(density.reshape(t.shape), delta)
-        return weights, composite(weights, color.reshape(*t.shape, 3), background)
+        density = density.reshape(t.shape)
+        weights = sample_weights(density, delta)
+        return weights, composite(weights, color.reshape(*t.shape, 3), background), (density, delta)
 
     def _noise(self, count: int) -> Tensor | None:
         """(count,) noise on the raw density, in training only."""

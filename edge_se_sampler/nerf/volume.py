@@ -32,6 +32,11 @@ def sample_weights(sigma: Tensor, delta: Tensor) -> Tensor:
     return transmittance * -torch.expm1(-depth)
 
 
+def opacity(sigma: Tensor, delta: Tensor) -> Tensor:
+    """alpha of every interval, (n, s) in [0, 1]."""
+    return -torch.expm1(-sigma * delta)
+
+
 def composite(weights: Tensor, colors: Tensor, background: Tensor) -> Tensor:
     """Colours of rays in front of a background.
 

@@ -1,0 +1,59 @@
+"""Training on a few of the views: which ones, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny import tiny_views
+
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.session import chosen_views, read_views
+from edge_se_sampler.errors import InputError
+
+
+def test_the_views_are_those_that_infonerfs_code_picks() -> None:
+    """From its own run: numpy.random.RandomState(0).permutation(100)[:10]."""
+    assert chosen_views(TrainerConfig(num_views=10), 100) == [26, 86, 2, 55, 75, 93, 16, 73, 54, 95]
+    assert chosen_views(TrainerConfig(num_views=4), 100) == [26, 86, 2, 55]
+    assert sorted(chosen_views(TrainerConfig(num_views=7), 7) or []) == list(range(7))
+    assert chosen_views(TrainerConfig(), 7) is None
+    assert chosen_views(TrainerConfig(views=(5, 0, 3)), 7) == [5, 0, 3]
+
+
+def test_a_subset_keeps_everything_of_its_views() -> None:
+    views = replace(tiny_views(4, 8, 6), masks=tuple(np.full((8, 6), i > 1) for i in range(4)))
+    few = views.subset([3, 1])
+    assert few.names == (views.names[3], views.names[1])
+    assert few.masks is not None
+    assert (few.masks[0].all(), few.masks[1].any()) == (True, False)
+    np.testing.assert_array_equal(few.images[0], views.images[3])
+    for key in ("camera_to_worlds", "focal", "principal"):
+        np.testing.assert_array_equal(getattr(few, key), getattr(views, key)[[3, 1]])
+
+
+def test_the_data_of_a_run_is_only_what_was_chosen(scene: Path) -> None:
+    everything = read_views(TrainerConfig(data=scene))
+    few = read_views(TrainerConfig(data=scene, views=(2,)))
+    assert few.names == everything.names[2:]
+    assert len(read_views(TrainerConfig(data=scene, num_views=2)).names) == 2
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"num_views": 0}, "--num-views is 0: must be between 1 and 3"),
+        ({"num_views": 4}, "--num-views is 4: must be between 1 and 3"),
+        ({"num_views": 2, "views": (1,)}, "--num-views and --views: give one of them"),
+        ({"views": ()}, "name each view once"),
+        ({"views": (1, 1)}, "name each view once"),
+        ({"views": (0, 3)}, "numbered 0 to 2"),
+        ({"views": (-1,)}, "numbered 0 to 2"),
+    ],
+)
+def test_choices_that_cannot_be_are_refused(choice: dict[str, Any], message: str, scene: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        read_views(replace(TrainerConfig(data=scene), **choice))
