@@ -185,7 +185,7 @@ class Methods:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure: edge-se bench samplers, quality or nerfstudio."""
+    """Measure: edge-se bench samplers, quality, paper or nerfstudio."""
 
 
 @dataclass(frozen=True)
@@ -275,6 +275,56 @@ class BenchNerfstudio:
             )
 
 
+@dataclass(frozen=True)
+class BenchPaper:
+    """Remake the paper's tables 1 to 4 on made scenes; leave result.json and tables.md. Goes on where it was ended."""
+
+    output_dir: Path
+    """Where the result goes; cells that it already has are kept."""
+    workplace: Path = Path("bench")
+    """Where scenes and runs are kept; workers on other machines must see it."""
+    tables: tuple[int, ...] = ()
+    """Of 1 to 4; none: all. 1, 2: NeRF with all views; 3, 4: InfoNeRF with 10; 2, 4: off centre."""
+    scenes: tuple[str, ...] = ()
+    """Of the seven made scenes; none: all."""
+    strategies: tuple[str, ...] = ()
+    """Of the paper's six, under the methods' names; none: all."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of weights, pixels and jitter."""
+    workers: int | None = None
+    """Cells trained at once, a thread each; left out, as many as there are cores."""
+    scheduler: str | None = None
+    """Address of a dask scheduler whose workers take the cells ([cluster] extra), instead of --workers."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells
+        from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
+        from edge_se_sampler.bench.paper.run import cores, executor_of, make_data, run_cells
+        from edge_se_sampler.bench.paper.tables import tables_of
+        from edge_se_sampler.engine.files import make_folder, write_atomically
+
+        for flag, chosen, known in (
+            ("tables", self.tables, tuple(TABLES)),
+            ("scenes", self.scenes, SCENES),
+            ("strategies", self.strategies, STRATEGIES),
+        ):
+            for name in chosen:
+                if name not in known:
+                    raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
+        if not self.seeds or (self.workers is not None and self.workers < 1):
+            raise InputError("--seeds and --workers: at least one")
+        preset = PRESETS["cpu"]
+        todo = cells(self.tables, self.scenes, self.strategies, self.seeds)
+        new_executor = executor_of(self.workers or cores(), self.scheduler)
+        make_folder(self.output_dir, "--output-dir")
+        data_of = make_data(preset, todo, self.workplace)
+        result = run_cells(todo, preset, data_of, self.output_dir, self.workplace, new_executor, threads=1)
+        write_atomically(self.output_dir / "tables.md", tables_of(result).encode())
+        for error in result["errors"]:
+            print(f"table {error['table']}, {error['scene']}, {error['strategy']}, {error['seed']}: {error['error']}")
+        print(f"{len(result['runs'])} cells; see {self.output_dir / 'tables.md'}")
+
+
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "scenes": Scenes,
@@ -286,7 +336,12 @@ COMMANDS: dict[str, type] = {
     "methods": Methods,
     "bench": Bench,
 }
-BENCHES: dict[str, type] = {"samplers": BenchSamplers, "quality": BenchQuality, "nerfstudio": BenchNerfstudio}
+BENCHES: dict[str, type] = {
+    "samplers": BenchSamplers,
+    "quality": BenchQuality,
+    "nerfstudio": BenchNerfstudio,
+    "paper": BenchPaper,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,0 +1,42 @@
+"""Whether a training got anywhere: the one rule behind every claim about stability here.
+
+Opacity tells nothing: with the last interval endless, a ray through white fog is as opaque as one that hits. So the
+rule compares with the image of the background alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from edge_se_sampler.engine.evaluation import Picture, measures
+
+Outcome = Literal["learnt", "slow", "background"]
+
+
+def background_measures(pictures: list[Picture], shade: float) -> list[dict[str, float | None]]:
+    """`measures` of answering every view with the background alone."""
+    return [measures(np.full((*p.image.shape[:2], 3), shade), p, shade) for p in pictures]
+
+
+def foreground_share(results: dict[str, Any], background: list[dict[str, float | None]]) -> float:
+    """Error on the object as a share of the error that the background alone has there, a mean over the views.
+
+    Args:
+        results: of `evaluate`.
+        background: of `background_measures` on the same views.
+    """
+    pairs = [
+        (own["foreground_psnr"], alone["foreground_psnr"])
+        for own, alone in zip(results["images"], background, strict=True)
+    ]
+    return float(np.mean([10 ** ((alone - own) / 10) for own, alone in pairs if own is not None and alone is not None]))
+
+
+def outcome(psnr: float, background_psnr: float, share: float) -> Outcome:
+    """ "background": nothing of the object was learnt; "slow": less than 0.5 dB better than the background alone, or
+    worse than it; "learnt" otherwise. The first two are failures."""
+    if share > 0.9:
+        return "background"
+    return "slow" if psnr < background_psnr + 0.5 else "learnt"
