@@ -86,6 +86,37 @@ class Scenes:
 
 
 @dataclass(frozen=True)
+class Offcenter:
+    """Move the object of one's own images off the centre, bit for bit: padded, shifted, and cx, cy in the json."""
+
+    data: Path
+    """A Blender folder."""
+    out: Path
+    """Folder that receives centered/ (padded only) and shifted/; it must not be there, or be empty."""
+    shift: tuple[float, float] = (0.2, 0.15)
+    """Where the picture goes, right and down, as fractions of its width and height; rounded to whole pixels."""
+    pad: tuple[float, float] | None = None
+    """Added left and right, and above and below, as such fractions; left out, as much as the shift: all fits."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.offcenter import offcenter
+        from edge_se_sampler.engine.progress import Progress
+
+        progress = Progress(0, "padding views")
+
+        def show(done: int, total: int) -> None:
+            progress.total = total
+            progress.update(done)
+
+        try:
+            made = offcenter(self.data, self.out, self.shift, self.pad, show)
+        finally:
+            progress.close()
+        for path in made:
+            print(path)
+
+
+@dataclass(frozen=True)
 class Train:
     """Train a method on a Blender folder: edge-se train METHOD --data DIR."""
 
@@ -328,6 +359,7 @@ class BenchPaper:
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "scenes": Scenes,
+    "offcenter": Offcenter,
     "train": Train,
     "resume": Resume,
     "eval": Eval,

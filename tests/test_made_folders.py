@@ -50,10 +50,10 @@ def test_folder_tells_the_truth(placement: Placement, tmp_path: Path) -> None:
         "bricks/train",
         "bricks/train/r_0.png",
         "bricks/train/r_1.png",
-        *(f"bricks/transforms_{split}.json" for split in ("test", "train", "val")),
-        "bricks/val",
-    ]
-    for split, count in (("train", 2), ("val", 0), ("test", 1)):
+        "bricks/transforms_test.json",
+        "bricks/transforms_train.json",
+    ]  # and no split without views, which no loader would take
+    for split, count in (("train", 2), ("test", 1)):
         document = json.loads((tmp_path / "bricks" / f"transforms_{split}.json").read_text())
         assert document["analog_of"] == "lego"
         assert document["made_by"] == "edge_se_sampler"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from edge_se_sampler.data import json_field as field
 from edge_se_sampler.data.image_file import ImageFile, read_image
 from edge_se_sampler.data.where import Where, shown
 
-_SPLITS = ("train", "val", "test")
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _RIGID_TOLERANCE = 1e-3  # of the rotation's entries: real files are rounded
 _LAST_ROW_TOLERANCE = 1e-6  # 0 and 1 survive rounding, so this only forgives arithmetic
@@ -75,12 +77,22 @@ class _Frame:
         return self.settings[key].value if key in self.settings else default
 
 
+def transforms_path(folder: Path, split: str) -> Path:
+    """The json of a split."""
+    return folder / f"transforms_{split}.json"
+
+
+def listed_file(name: str) -> str:
+    """The file, relative to the folder, that a file_path or mask_path means: .png may be left out."""
+    return name if name.lower().endswith(_SUFFIXES) else f"{name}.png"
+
+
 def has_split(folder: Path, split: str) -> bool:
     """Whether the folder has a transforms_<split>.json."""
-    return os.path.exists(_transforms(Path(folder), split))
+    return os.path.exists(transforms_path(Path(folder), split))
 
 
-def read_blender(folder: Path, split: Literal["train", "val", "test"]) -> Views:
+def read_blender(folder: Path, split: Split) -> Views:
     """Read one split of a scene; the files that no frame lists are not looked at.
 
     Poses are given as written (not moved, scaled or made orthonormal). Without masks every pixel counts; if some
@@ -89,7 +101,7 @@ def read_blender(folder: Path, split: Literal["train", "val", "test"]) -> Views:
     """
     folder = Path(folder)
     _check_folder(folder, split)
-    where = Where(_transforms(folder, split))
+    where = Where(transforms_path(folder, split))
     top = field.load_object(where)
     frames = _frames(top, where)
     half_tan = _half_tan(top, where, frames)
@@ -115,10 +127,6 @@ def read_blender(folder: Path, split: Literal["train", "val", "test"]) -> Views:
     )
 
 
-def _transforms(folder: Path, split: str) -> Path:
-    return folder / f"transforms_{split}.json"
-
-
 def _check_folder(folder: Path, split: str) -> None:
     """Raise InputError unless `folder` is a folder that has the split."""
     where = Where(folder)
@@ -130,10 +138,10 @@ def _check_folder(folder: Path, split: str) -> None:
         raise where.error("may not be read (permission denied)", "change the folder's permissions")
     if has_split(folder, split):
         return
-    found = ", ".join(_transforms(folder, other).name for other in _SPLITS if has_split(folder, other))
+    found = ", ".join(transforms_path(folder, other).name for other in SPLITS if has_split(folder, other))
     hint = "a Blender scene has transforms_train.json and, for other splits, transforms_val.json, transforms_test.json"
     has = f"only {found}" if found else "nor that of any other split"
-    raise where.error(f"has no {_transforms(folder, split).name}, {has}", hint)
+    raise where.error(f"has no {transforms_path(folder, split).name}, {has}", hint)
 
 
 def _frames(top: field.Object, where: Where) -> list[_Frame]:
@@ -212,7 +220,7 @@ def _locate(name: str, where: Where, folder: Path) -> ImageFile:
     """The file that `name` means; InputError if that lies outside `folder`, be it through a link."""
     if os.path.isabs(name):
         raise where.error(f"{shown(name)} is an absolute path", "write it relative to the folder")
-    listed = name if name.lower().endswith(_SUFFIXES) else f"{name}.png"
+    listed = listed_file(name)
     path = Path(os.path.realpath(folder / listed))
     if not path.is_relative_to(os.path.realpath(folder)):
         raise where.error(f"{shown(listed)} leads out of the folder", "put the file into the folder")

@@ -6,10 +6,9 @@ import json
 import multiprocessing
 import os
 import signal
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from edge_se_sampler.data.made.cameras import Camera, Framing, Placement, Split, framing, poses
 from edge_se_sampler.data.made.catalogue import ANALOG_OF, SCENE_NAMES, check_name, made_scene
 from edge_se_sampler.data.made.render import render
+from edge_se_sampler.data.new_folder import appearing, check_free
 from edge_se_sampler.errors import InputError
 
 _VIEWS_PER_TASK = 5
@@ -77,18 +77,14 @@ def make_scenes(
     _check_numbers(counts, seed)
     frame = framing(size, placement, offset)
     targets = [Path(out) / name for name in names]
-    _check_targets(Path(out), targets)
+    check_free(Path(out), targets)
 
     cameras: dict[Split, list[Camera]] = {
         split: [frame.camera(pose) for pose in poses(split, count, seed)] for split, count in counts.items()
     }
-    with _workspace(Path(out)) as workspace:
+    with appearing(Path(out), targets) as workspace:
         views = [view for name in names for view in _lay_out(workspace, name, frame, cameras)]
         _render_all(views, workspace, progress or (lambda done, total: None))
-        for target in targets:
-            if target.exists():
-                target.rmdir()  # it was empty; if it no longer is, this raises, and nothing is overwritten
-            (workspace / target.name).rename(target)
     return targets
 
 
@@ -110,45 +106,12 @@ def _check_numbers(counts: Mapping[Split, int], seed: int) -> None:
         raise InputError(f"seed is {seed}: give a number from 0 to {2**31 - 1}")
 
 
-def _check_targets(out: Path, targets: Sequence[Path]) -> None:
-    """Raises InputError unless every target can be written without touching anything that is there."""
-    try:
-        there = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
-        if not there.is_dir():
-            raise InputError(f"out is {out}, but {there} is not a folder: give a folder, or a path that is free")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"out is {out}, but {there} is not writable: give a folder that is")
-        for target in targets:
-            empty_folder = target.is_dir() and not target.is_symlink() and not any(target.iterdir())
-            if os.path.lexists(target) and not empty_folder:
-                raise InputError(f"{target} is there already and is never overwritten: remove it, or give another out")
-    except OSError as error:
-        raise InputError(f"out is {out}, which cannot be read ({error.strerror}): give another folder") from error
-
-
-@contextmanager
-def _workspace(out: Path) -> Iterator[Path]:
-    """A temporary folder inside `out`; on any exception it goes again, and so does what of `out` was not there."""
-    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            workspace = tempfile.TemporaryDirectory(prefix=".making-", dir=out)
-        except OSError as error:
-            raise InputError(f"out is {out}, which cannot be written ({error.strerror}): give another") from error
-        with workspace:
-            yield Path(workspace.name)
-    except BaseException:
-        with suppress(OSError):  # someone else's files have come in between: they stay
-            for folder in missing:
-                folder.rmdir()
-        raise
-
-
 def _lay_out(workspace: Path, name: str, frame: Framing, cameras: Mapping[Split, Sequence[Camera]]) -> list[_View]:
     """Writes everything of a scene but the pictures; returns the views to fill in."""
     views = []
     for split, of_split in cameras.items():
+        if not of_split:
+            continue  # a split without frames is refused when it is read
         (workspace / name / split).mkdir(parents=True)
         files = [f"{split}/r_{index}" for index in range(len(of_split))]
         document = {

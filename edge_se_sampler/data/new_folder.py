@@ -1,0 +1,54 @@
+"""Folders that appear whole or not at all, and never in place of anything that is there."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from edge_se_sampler.errors import InputError
+
+
+def check_free(out: Path, targets: Sequence[Path]) -> None:
+    """Raises InputError unless every target, a path in `out`, can be written without touching anything there."""
+    try:
+        there = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
+        if not there.is_dir():
+            raise InputError(f"out is {out}, but {there} is not a folder: give a folder, or a path that is free")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise InputError(f"out is {out}, but {there} is not writable: give a folder that is")
+        for target in targets:
+            empty_folder = target.is_dir() and not target.is_symlink() and not any(target.iterdir())
+            if os.path.lexists(target) and not empty_folder:
+                raise InputError(f"{target} is there already and is never overwritten: remove it, or give another out")
+    except OSError as error:
+        raise InputError(f"out is {out}, which cannot be read ({error.strerror}): give another folder") from error
+
+
+@contextmanager
+def appearing(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
+    """A temporary folder inside `out` to write workspace/<name> of every target into; at the end they are moved.
+
+    On any exception it goes again, and so does what of `out` was not there. A target that was empty and no longer is
+    raises OSError: nothing is overwritten.
+    """
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            workspace = tempfile.TemporaryDirectory(prefix=".making-", dir=out)
+        except OSError as error:
+            raise InputError(f"out is {out}, which cannot be written ({error.strerror}): give another") from error
+        with workspace:
+            yield Path(workspace.name)
+            for target in targets:
+                if target.exists():
+                    target.rmdir()  # empty, or this raises
+                (Path(workspace.name) / target.name).rename(target)
+    except BaseException:
+        with suppress(OSError):  # someone else's files have come in between: they stay
+            for folder in missing:
+                folder.rmdir()
+        raise

@@ -1,0 +1,371 @@
+"""Off-centre counterparts of a folder: nothing but the place differs, and the json says so."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from blender_folder import ANGLE, HEIGHT, WIDTH, pixels, write_json, write_scene
+from test_cli_bad_input import refused
+
+from edge_se_sampler.data.blender import SPLITS, Split, read_blender
+from edge_se_sampler.data.made import make_scenes
+from edge_se_sampler.data.offcenter import offcenter
+from edge_se_sampler.engine.evaluation import Picture, pictures_of
+from edge_se_sampler.errors import InputError
+
+TWINS = ("centered", "shifted")
+SHIFT = (0.4, -0.3)  # 2 pixels right, 1 up, of 6 x 4; padded as much, the canvas is 10 x 6
+WHITE = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+
+
+def read_json(folder: Path, split: str = "train") -> dict[str, Any]:
+    return json.loads((folder / f"transforms_{split}.json").read_text())
+
+
+def on_canvas(picture: np.ndarray, columns: int, rows: int, x: int, y: int, around: int = 0) -> np.ndarray:
+    """What a twin should show: (H', W', ...) with the picture's corner at (x, y)."""
+    canvas = np.full((rows, columns, *picture.shape[2:]), around, np.uint8)
+    canvas[y : y + len(picture), x : x + picture.shape[1]] = picture
+    return canvas
+
+
+def twins_of(data: Path) -> list[tuple[Path, tuple[int, int]]]:
+    """Both twins of a 6 x 4 scene under SHIFT, and the corner of the pictures in each."""
+    return list(zip(offcenter(data, data.with_name("out"), SHIFT), ((2, 1), (4, 0)), strict=True))
+
+
+def refusal(data: Path, out: Path, **arguments: Any) -> str:
+    """The one line of a refusal that leaves everything beside `data` as it was."""
+    before = sorted(data.parent.rglob("*"))
+    with pytest.raises(InputError) as caught:
+        offcenter(data, out, **arguments)
+    assert sorted(data.parent.rglob("*")) == before
+    assert str(caught.value).isprintable()
+    return str(caught.value)
+
+
+class TestPixels:
+    @pytest.mark.parametrize(
+        ("shift", "pad", "size", "corners"),
+        [
+            pytest.param(SHIFT, None, (10, 6), ((2, 1), (4, 0)), id="as much padding as shift"),
+            pytest.param((-0.4, 0.3), None, (10, 6), ((2, 1), (0, 2)), id="left and down"),
+            pytest.param(SHIFT, (0.5, 0.25), (12, 6), ((3, 1), (5, 0)), id="more padding"),
+            pytest.param((0.1, 0.1), None, (8, 4), ((1, 0), (2, 0)), id="rounded to whole pixels"),
+            pytest.param((0, 0), (0, 0), (6, 4), ((0, 0), (0, 0)), id="nothing asked for"),
+        ],
+    )
+    def test_every_byte_is_kept_and_all_else_is_padding(self, shift, pad, size, corners, tmp_path: Path) -> None:
+        for split in SPLITS:
+            write_scene(tmp_path / "scene", split=split)
+        made = offcenter(tmp_path / "scene", tmp_path / "out", shift, pad)
+        assert made == [tmp_path / "out" / twin for twin in TWINS]
+        for folder, corner in zip(made, corners, strict=True):
+            for split in SPLITS:
+                for i in range(3):
+                    found = iio.imread(folder / split / f"r_{i}.png")
+                    np.testing.assert_array_equal(found, on_canvas(pixels(i), *size, *corner), strict=True)
+
+    def test_the_default_is_the_made_scenes_offset(self, tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene", n=1)
+        iio.imwrite(tmp_path / "scene/train/r_0.png", pixels(0, 20, 20))
+        _, shifted = offcenter(tmp_path / "scene", tmp_path / "out")
+        found = iio.imread(shifted / "train/r_0.png")
+        np.testing.assert_array_equal(found, on_canvas(pixels(0, 20, 20), 28, 26, 8, 6), strict=True)
+
+    def test_rgb_is_padded_with_the_colour_of_its_border(self, tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene", n=1)
+        picture = WHITE.copy()
+        picture[1:3, 2:5] = pixels(0)[1:3, 2:5, :3]
+        iio.imwrite(tmp_path / "scene/train/r_0.png", picture)
+        for folder, corner in twins_of(tmp_path / "scene"):
+            expected = on_canvas(picture, 10, 6, *corner, around=255)
+            np.testing.assert_array_equal(iio.imread(folder / "train/r_0.png"), expected, strict=True)
+
+    @pytest.mark.parametrize("place", [(0, 0), (0, 3), (HEIGHT - 1, 2), (2, 0), (1, WIDTH - 1)])
+    def test_rgb_without_a_plain_border_is_refused(self, place: tuple[int, int], tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene")
+        for i in range(3):
+            iio.imwrite(tmp_path / f"scene/train/r_{i}.png", WHITE)
+        spoilt = WHITE.copy()
+        spoilt[place] = 255, 254, 255
+        iio.imwrite(tmp_path / "scene/train/r_1.png", spoilt)
+        line = refusal(tmp_path / "scene", tmp_path / "out")
+        assert "transforms_train.json: frames[1].file_path: './train/r_1.png' has no plain background" in line
+        assert "RGBA" in line
+
+    def test_masks_hide_the_padding(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        mask = pixels(9, channels=3)[..., 0] & 1
+        iio.imwrite(tmp_path / "scene/m.png", mask)  # 0 and 1: what is not black may be trained on
+        for i in range(2):
+            doc["frames"][i]["mask_path"] = "m"  # shared
+        write_json(tmp_path / "scene", doc)
+        for folder, corner in twins_of(tmp_path / "scene"):
+            masks = read_blender(folder, "train").masks
+            assert masks is not None
+            for i in range(2):
+                np.testing.assert_array_equal(masks[i], on_canvas(mask, 10, 6, *corner) > 0)
+            assert masks[2].all()  # of a frame that has none all counts, as before
+            assert iio.imread(folder / "m.png").shape == (6, 10)  # grey, as other hosts want it
+
+
+class TestCameras:
+    @pytest.fixture
+    def folders(self, tmp_path: Path) -> list[Path]:
+        """A made scene, its centred and its shifted twin."""
+        made = make_scenes(tmp_path, ["mic"], size=20, num_train=2, num_val=1, num_test=1, placement="centered")
+        return [*made, *offcenter(made[0], tmp_path / "out")]
+
+    @staticmethod
+    def seen(picture: Picture, corner: tuple[int, int]) -> dict[str, np.ndarray]:
+        """Origins, directions and colours of the 20 x 20 pixels at a corner."""
+        rays = picture.generator.image(picture.camera)
+        x, y = corner
+        height, width = picture.image.shape[:2]
+        flat = {"origins": rays.origins.numpy(), "directions": rays.directions.numpy(), "colours": picture.image}
+        return {k: v.reshape(height, width, -1)[y : y + 20, x : x + 20] for k, v in flat.items()}
+
+    @pytest.mark.parametrize("split", SPLITS)
+    def test_every_pixel_keeps_its_ray_and_its_colour(self, split: Split, folders: list[Path]) -> None:
+        source, *twins = [pictures_of(read_blender(folder, split)) for folder in folders]
+        for pictures, corner in zip(twins, ((4, 3), (8, 6)), strict=True):
+            for before, after in zip(source, pictures, strict=True):
+                assert after.image.shape == (26, 28, 4)
+                expected, found = self.seen(before, (0, 0)), self.seen(after, corner)
+                for key in expected:
+                    np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=1e-6, err_msg=key)
+
+    def test_without_cx_and_cy_the_rays_are_others(self, folders: list[Path]) -> None:
+        doc = read_json(folders[2])
+        del doc["cx"], doc["cy"]
+        write_json(folders[2], doc)
+        before, after = (pictures_of(read_blender(folders[i], "train"))[0] for i in (0, 2))
+        apart = self.seen(after, (8, 6))["directions"] - self.seen(before, (0, 0))["directions"]
+        assert np.abs(apart).max(axis=2).min() > 0.05
+
+    def test_focal_lengths_are_the_same_bits(self, folders: list[Path]) -> None:
+        focal = read_blender(folders[0], "train").focal
+        for folder in folders[1:]:
+            np.testing.assert_array_equal(read_blender(folder, "train").focal, focal)
+            doc = read_json(folder)
+            assert (doc["w"], doc["h"]) == (28, 26)
+            by_angle = 0.5 * 28 / math.tan(0.5 * doc["camera_angle_x"])  # all that some loaders read
+            np.testing.assert_allclose(by_angle, focal[:, 0], rtol=1e-14)
+
+    def test_lengths_and_principal_points_of_the_source(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        doc |= {"fl_x": 10.1, "fl_y": 11.5, "cx": 2.5, "w": WIDTH, "h": float(HEIGHT)}
+        doc["frames"][1] |= {"fl_x": 20.25, "cy": 1.75}
+        doc["frames"][2] |= {"fl_y": 11.5, "cx": 2.5, "w": WIDTH}  # no other than the file's
+        write_json(tmp_path / "scene", doc)
+        for folder, corner in twins_of(tmp_path / "scene"):
+            views = read_blender(folder, "train")
+            np.testing.assert_array_equal(views.focal, [[10.1, 11.5], [20.25, 11.5], [10.1, 11.5]])
+            np.testing.assert_array_equal(views.principal - corner, [[2.5, 2], [2.5, 1.75], [2.5, 2]])
+
+    def test_sizes_may_differ_and_then_there_is_no_one_angle(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        iio.imwrite(tmp_path / "scene/train/r_1.png", pixels(7, 10, 8))
+        doc["frames"][1] |= {"w": 10, "h": 8}
+        write_json(tmp_path / "scene", doc)
+        before = read_blender(tmp_path / "scene", "train")
+        _, shifted = offcenter(tmp_path / "scene", tmp_path / "out", SHIFT)
+        after = read_blender(shifted, "train")
+        assert [image.shape[:2] for image in after.images] == [(6, 10), (12, 18), (6, 10)]
+        np.testing.assert_array_equal(after.focal, before.focal)
+        np.testing.assert_array_equal(after.principal - before.principal, [[4, 0], [8, 0], [4, 0]])
+        assert "camera_angle_x" not in read_json(shifted)
+
+
+class TestJson:
+    def test_order_names_poses_and_further_keys_stay(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        doc |= {"aabb_scale": [4, None], "k1": "?", "frames": doc["frames"][::-1]}
+        doc["frames"][0] |= {"time": {"unknown": True}, "file_path": "train/../train/r_2"}
+        write_json(tmp_path / "scene", doc)
+        for folder in offcenter(tmp_path / "scene", tmp_path / "out"):
+            found = read_json(folder)
+            new = {"w", "h", "fl_x", "fl_y", "cx", "cy"}
+            assert set(found) == set(doc) | new
+            assert all(found[key] == doc[key] for key in doc if key != "camera_angle_x")  # frames to the last bit
+            views = read_blender(folder, "train")
+            assert views.names == ("train/../train/r_2", "./train/r_1", "./train/r_0")
+            assert len(views.images) == 3
+
+    def test_a_jpeg_becomes_a_png_that_has_its_pixels(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene", n=1)
+        picture = np.full((48, 48, 3), 255, np.uint8)
+        picture[16:32, 16:32] = pixels(0, 16, 16, 3)  # whole blocks of the JPEG away from its border
+        iio.imwrite(tmp_path / "scene/train/photo.JPG", picture, extension=".jpg")
+        doc["frames"][0]["file_path"] = "train/photo.JPG"
+        write_json(tmp_path / "scene", doc)
+        before = read_blender(tmp_path / "scene", "train").images[0]
+        centered, _ = offcenter(tmp_path / "scene", tmp_path / "out", (0.25, 0))
+        assert read_json(centered)["frames"][0]["file_path"] == "train/photo.png"
+        np.testing.assert_array_equal(read_blender(centered, "train").images[0][:, 12:60], before)
+
+    def test_splits_may_share_their_images(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        write_json(tmp_path / "scene", doc, "test")
+        centered, _ = offcenter(tmp_path / "scene", tmp_path / "out", SHIFT)
+        np.testing.assert_array_equal(
+            read_blender(centered, "test").images[1], on_canvas(pixels(1), 10, 6, 2, 1), strict=True
+        )
+
+    @pytest.mark.parametrize(
+        ("key", "path", "says"),
+        [
+            pytest.param("mask_path", "train/r_1", "over another picture, 'train/r_1.png'", id="an image as mask"),
+            pytest.param("file_path", "train/r_1.jpg", "over another picture, 'train/r_1.png'", id="two to one"),
+            pytest.param("file_path", "../scene/train/r_0", "leads out of the folder", id="out and in again"),
+            pytest.param("file_path", "../r_0", "leads out of the folder", id="out"),
+        ],
+    )
+    def test_paths_that_would_overwrite_or_leave(self, key: str, path: str, says: str, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        os.rename(tmp_path / "scene/train/r_2.png", tmp_path / "scene/train/r_1.jpg")  # in the content lies the kind
+        doc["frames"][2]["file_path"] = "train/r_1.jpg"
+        if key == "mask_path" or path.startswith(".."):
+            doc["frames"].pop()
+        doc["frames"][-1 if path.endswith("jpg") else 0][key] = path
+        write_json(tmp_path / "scene", doc)
+        assert says in refusal(tmp_path / "scene", tmp_path / "out")
+
+
+class TestClipping:
+    """6 x 4 pixels, shifted by 2 and -1: without padding, columns 4 and 5 and row 0 go."""
+
+    @staticmethod
+    def scene(folder: Path, *objects: tuple[slice, slice], split: Split = "train", channels: int = 4) -> None:
+        """A view for each object, the rest background."""
+        write_scene(folder, n=len(objects), split=split)
+        for i, place in enumerate(objects):
+            picture = np.full((HEIGHT, WIDTH, channels), 0 if channels == 4 else 255, np.uint8)
+            picture[place] = 7
+            iio.imwrite(folder / split / f"r_{i}.png", picture)
+
+    @pytest.mark.parametrize("channels", [3, 4])
+    def test_background_may_go(self, channels: int, tmp_path: Path) -> None:
+        self.scene(tmp_path / "scene", np.s_[1:3, 1:4], channels=channels)
+        _, shifted = offcenter(tmp_path / "scene", tmp_path / "out", SHIFT, (0, 0))
+        around = 0 if channels == 4 else 255
+        expected = on_canvas(np.full((2, 3, channels), 7, np.uint8), 6, 4, 3, 0, around)
+        np.testing.assert_array_equal(iio.imread(shifted / "train/r_0.png"), expected, strict=True)
+        np.testing.assert_array_equal(read_blender(shifted, "train").principal, [[WIDTH / 2 + 2, HEIGHT / 2 - 1]])
+
+    def test_the_object_may_not(self, tmp_path: Path) -> None:
+        self.scene(tmp_path / "scene", np.s_[1:3, 1:4], np.s_[0:3, 1:5])
+        self.scene(tmp_path / "scene", np.s_[1:3, 2:6], split="test")
+        line = refusal(tmp_path / "scene", tmp_path / "out", shift=SHIFT, pad=(0, 0))
+        assert "transforms_train.json: frames[1].file_path: './train/r_1.png' would lose 6 pixels" in line
+        assert "(2 views would lose some)" in line
+        assert "--pad 0.333333 0.25" in line  # 2 pixels for the test view, 1 for this one
+        for less in ((0.16, 0.25), (0.333333, 0.1)):
+            assert "would lose" in refusal(tmp_path / "scene", tmp_path / "out", shift=SHIFT, pad=less)
+        offcenter(tmp_path / "scene", tmp_path / "out", SHIFT, (0.333333, 0.25))
+
+    def test_in_rgb_other_colours_than_the_borders_are_the_object(self, tmp_path: Path) -> None:
+        self.scene(tmp_path / "scene", np.s_[1:3, 1:5], channels=3)
+        line = refusal(tmp_path / "scene", tmp_path / "out", shift=SHIFT, pad=(0, 0))
+        assert "would lose 2 pixels" in line
+        assert "--pad 0.166667 0, or" in line
+
+    def test_faint_pixels_count_and_colours_without_alpha_do_not(self, tmp_path: Path) -> None:
+        self.scene(tmp_path / "scene", np.s_[1:3, 1:4])
+        picture = iio.imread(tmp_path / "scene/train/r_0.png")
+        picture[0, 0] = 9, 9, 9, 0
+        iio.imwrite(tmp_path / "scene/train/r_0.png", picture)
+        offcenter(tmp_path / "scene", tmp_path / "out", SHIFT, (0, 0))
+        picture[0, 0, 3] = 1
+        iio.imwrite(tmp_path / "scene/train/r_0.png", picture)
+        assert "would lose 1 pixels" in refusal(tmp_path / "scene", tmp_path / "out2", shift=SHIFT, pad=(0, 0))
+
+
+class TestOut:
+    def test_what_is_there_is_never_touched(self, tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene")
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out/mine.txt").write_text("mine")
+        (tmp_path / "file").write_text("mine")
+        assert "out is there already" in refusal(tmp_path / "scene", tmp_path / "out")
+        assert "scene is there already" in refusal(tmp_path / "scene", tmp_path / "scene")
+        assert "file is there already" in refusal(tmp_path / "scene", tmp_path / "file")
+        assert "not a folder" in refusal(tmp_path / "scene", tmp_path / "file/below")
+        assert (tmp_path / "out/mine.txt").read_text() == (tmp_path / "file").read_text() == "mine"
+
+    def test_an_empty_folder_is_filled(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        write_scene(tmp_path / "scene")
+        (tmp_path / "out").mkdir()
+        monkeypatch.chdir(tmp_path)
+        offcenter(Path("scene"), Path("out/below/../"))
+        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list(TWINS)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "scene"]
+
+    @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+    def test_a_failure_leaves_nothing_behind(self, error: type[BaseException], tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene")
+        told = []
+
+        def fail(done: int, total: int) -> None:
+            told.append((done, total))
+            if done == 2:
+                assert list((tmp_path / "deep").glob(".making-*/out/shifted/train/*.png"))  # work was under way
+                assert not (tmp_path / "deep/out").exists()
+                raise error
+
+        with pytest.raises(error):
+            offcenter(tmp_path / "scene", tmp_path / "deep/out", progress=fail)
+        assert told == [(1, 3), (2, 3)]
+        assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+    def test_a_bad_split_is_found_before_anything_is_written(self, tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene")
+        doc = write_scene(tmp_path / "scene", split="test")
+        write_json(tmp_path / "scene", doc | {"camera_angle_x": -ANGLE}, "test")
+        told = []
+        line = refusal(tmp_path / "scene", tmp_path / "out", progress=lambda done, total: told.append(done))
+        assert "transforms_test.json: camera_angle_x" in line
+        assert not told
+
+
+class TestCommand:
+    def test_it_does_what_it_says(self, scene: Path, tmp_path: Path, edge_se) -> None:
+        out = tmp_path / "out"
+        answer = edge_se("offcenter", "--data", scene, "--out", out, "--shift", -0.25, 0.125, "--pad", 0.3, 0.125)
+        assert (answer.code, answer.err) == (0, "")
+        assert answer.out.split() == [str(out / twin) for twin in TWINS]
+        pictures = {twin: iio.imread(out / twin / "val/r_0.png") for twin in TWINS}
+        source = iio.imread(scene / "val/r_0.png")
+        np.testing.assert_array_equal(pictures["centered"], on_canvas(source, 38, 30, 7, 3), strict=True)
+        np.testing.assert_array_equal(pictures["shifted"], on_canvas(source, 38, 30, 1, 6), strict=True)
+
+    @pytest.mark.parametrize(
+        ("flags", "says"),
+        [
+            (("--shift", "nan", 0), "shift is (nan, 0.0)"),
+            (("--shift", 0, 1), "between -1 and 1"),
+            (("--shift", -1.5, 0), "between -1 and 1"),
+            (("--shift", "inf", 0), "between -1 and 1"),
+            (("--shift", "far", 0), "--shift"),
+            (("--pad", -0.1, 0), "from 0 to 1"),
+            (("--pad", "nan", 0), "from 0 to 1"),
+            (("--pad", 0, 1e9), "from 0 to 1"),
+            (("--pad", 0, 0, "--shift", 0.5, 0), "would lose"),
+            (("--out", "scene"), "is there already"),
+            (("--data", "nowhere"), "no such folder"),
+            (("--data", "."), "has no transforms_train.json"),
+        ],
+    )
+    def test_bad_input(self, flags, says: str, scene: Path, tmp_path: Path, edge_se, monkeypatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        there = sorted(tmp_path.rglob("*"))
+        assert says in refused(edge_se, tmp_path, "offcenter", "--data", scene, "--out", "out", *flags)
+        assert sorted(tmp_path.rglob("*")) == there
