@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
+from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
@@ -219,143 +220,6 @@ class Bench:
     """Measure: edge-se bench samplers, quality, paper or nerfstudio."""
 
 
-@dataclass(frozen=True)
-class BenchSamplers:
-    """Time building tables, drawing and selecting pixels; compare the memory of SE with Random's."""
-
-    output_path: Path | None = None
-    """A json to write besides printing."""
-    images: int = 100
-    """Images in the tables."""
-    size: int = 800
-    """Rows and columns of an image."""
-    draws: int = 4096
-    """Pixels a draw."""
-    repeats: int = 200
-    """Rounds; the median of each kind of draw is reported."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.samplers import bench_samplers, table_of
-        from edge_se_sampler.engine.files import make_folder, write_json
-
-        if self.output_path is not None:
-            make_folder(self.output_path.parent, "--output-path, folder")
-        if min(self.images, self.size, self.draws, self.repeats) < 1:
-            raise InputError("--images, --size, --draws and --repeats must be at least 1")
-        result = bench_samplers(self.images, self.size, self.draws, self.repeats)
-        print(table_of(result))
-        if self.output_path is not None:
-            write_json(self.output_path, result)
-
-
-@dataclass(frozen=True)
-class BenchQuality:
-    """Train a method on a made scene for some minutes; leave result.json and curve.png."""
-
-    output_dir: Path
-    """Where the result goes."""
-    workplace: Path = Path("bench")
-    """Where the scene and the run are kept."""
-    method: str = "edge-se-nerf"
-    """One of edge-se methods."""
-    scene: str = "bricks"
-    """One of edge-se scenes."""
-    seconds: float = 180
-    """Of training at most."""
-    seed: int = 0
-    """Of weights, pixels and jitter."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.quality import bench_quality
-
-        if self.method not in registered_methods():
-            raise InputError(f"--method {self.method!r} is not registered; see edge-se methods")
-        result = bench_quality(self.output_dir, self.workplace, self.method, self.scene, self.seconds, self.seed)
-        print(f"{result['results']['psnr']:.2f} dB after {result['seconds']:.0f} s; see {self.output_dir}")
-
-
-@dataclass(frozen=True)
-class BenchNerfstudio:
-    """Count failures inside nerfstudio, with its own sampler and with ours; leave result.json. Resumes."""
-
-    output_dir: Path
-    """Where the result goes; runs that it already has are kept."""
-    workplace: Path = Path("bench")
-    """Where the scene and nerfstudio's runs are kept."""
-    scene: str = "chair"
-    """One of edge-se scenes."""
-    seeds: tuple[int, ...] = tuple(range(10))
-    """Of weights, pixels and jitter."""
-    iterations: int = 1500
-    """Of every run."""
-    rays: int = 32
-    """Pixels a step."""
-    samples: int = 16
-    """Coarse samples a ray, and as many importance samples."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.nerfstudio import bench_nerfstudio
-
-        result = bench_nerfstudio(
-            self.output_dir, self.workplace, self.scene, self.seeds, self.iterations, self.rays, self.samples
-        )
-        for method, told in result["failures"].items():
-            print(
-                f"{method}: {told['failed']} of {told['runs']} failed, {told['at_background']} at the background; "
-                f"{told['mean_psnr']:.2f} dB on average"
-            )
-
-
-@dataclass(frozen=True)
-class BenchPaper:
-    """Remake the paper's tables 1 to 4 on made scenes; leave result.json and tables.md. Goes on where it was ended."""
-
-    output_dir: Path
-    """Where the result goes; cells that it already has are kept."""
-    workplace: Path = Path("bench")
-    """Where scenes and runs are kept; workers on other machines must see it."""
-    tables: tuple[int, ...] = ()
-    """Of 1 to 4; none: all. 1, 2: NeRF with all views; 3, 4: InfoNeRF with 10; 2, 4: off centre."""
-    scenes: tuple[str, ...] = ()
-    """Of the seven made scenes; none: all."""
-    strategies: tuple[str, ...] = ()
-    """Of the paper's six, under the methods' names; none: all."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Of weights, pixels and jitter."""
-    workers: int | None = None
-    """Cells trained at once, a thread each; left out, as many as there are cores."""
-    scheduler: str | None = None
-    """Address of a dask scheduler whose workers take the cells ([cluster] extra), instead of --workers."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells
-        from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
-        from edge_se_sampler.bench.paper.run import cores, executor_of, make_data, run_cells
-        from edge_se_sampler.bench.paper.tables import tables_of
-        from edge_se_sampler.engine.files import make_folder, write_atomically
-
-        for flag, chosen, known in (
-            ("tables", self.tables, tuple(TABLES)),
-            ("scenes", self.scenes, SCENES),
-            ("strategies", self.strategies, STRATEGIES),
-        ):
-            for name in chosen:
-                if name not in known:
-                    raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
-        if not self.seeds or (self.workers is not None and self.workers < 1):
-            raise InputError("--seeds and --workers: at least one")
-        preset = PRESETS["cpu"]
-        todo = cells(self.tables, self.scenes, self.strategies, self.seeds)
-        new_executor = executor_of(self.workers or cores(), self.scheduler)
-        make_folder(self.output_dir, "--output-dir")
-        data_of = make_data(preset, todo, self.workplace)
-        result = run_cells(todo, preset, data_of, self.output_dir, self.workplace, new_executor, threads=1)
-        write_atomically(self.output_dir / "tables.md", tables_of(result).encode())
-        for error in result["errors"]:
-            print(f"table {error['table']}, {error['scene']}, {error['strategy']}, {error['seed']}: {error['error']}")
-        print(f"{len(result['runs'])} cells; see {self.output_dir / 'tables.md'}")
-
-
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "scenes": Scenes,
@@ -367,12 +231,6 @@ COMMANDS: dict[str, type] = {
     "show": Show,
     "methods": Methods,
     "bench": Bench,
-}
-BENCHES: dict[str, type] = {
-    "samplers": BenchSamplers,
-    "quality": BenchQuality,
-    "nerfstudio": BenchNerfstudio,
-    "paper": BenchPaper,
 }
 
 

@@ -36,7 +36,8 @@ def test_a_killed_worker_of_a_cluster_costs_no_cell(tmp_path: Path, monkeypatch:
     todo = [Cell(1, "mic", "edge-nerf", seed) for seed in range(8)]
     for name in ("out", "w"):
         (tmp_path / name).mkdir()
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)  # pyright: ignore[reportArgumentType]
+    with cluster:
         executor = running.executor_of(1, cluster.scheduler_address)
         result = running.run_cells(todo, SMALL, lambda _: tmp_path, tmp_path / "out", tmp_path / "w", executor, 1)
     assert (tmp_path / "w" / "killed").exists()
