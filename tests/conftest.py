@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from tiny import SMALL
 
 from edge_se_sampler.cli import main
 from edge_se_sampler.data.made import make_scenes
@@ -47,14 +48,6 @@ def edge_se(capfd: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
         return Answer(code, captured.out, captured.err)
 
     return call
-
-
-SMALL = (
-    "--max-num-iterations", "6", "--pipeline.datamanager.train-num-rays-per-batch", "16",
-    "--pipeline.model.num-coarse-samples", "8", "--pipeline.model.num-importance-samples", "8",
-    "--machine.device-type", "cpu",
-)  # fmt: skip
-"""Flags of a training that takes a moment."""
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from conftest import SMALL
+from tiny import SMALL
 
 from edge_se_sampler.cli import BENCHES, COMMANDS
 from edge_se_sampler.methods import STRATEGIES

@@ -9,7 +9,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from conftest import SMALL
+from tiny import SMALL
 
 from edge_se_sampler.engine.trainer import Trainer
 

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import SMALL
-from tiny import tiny_config, tiny_rays, tiny_views
+from tiny import SMALL, tiny_config, tiny_rays, tiny_views
 from torch import Tensor
 
 from edge_se_sampler.cameras import Cameras, RayBundle

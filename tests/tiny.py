@@ -1,4 +1,4 @@
-"""A tiny NeRF, rays through its sampled shell, and views of random pixels."""
+"""A tiny NeRF, rays through its sampled shell, views of random pixels, and a tiny training's flags."""
 
 from __future__ import annotations
 
@@ -12,6 +12,13 @@ from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.nerf.config import NeRFModelConfig
 from edge_se_sampler.nerf.model import NeRFModel
+
+SMALL = (
+    "--max-num-iterations", "6", "--pipeline.datamanager.train-num-rays-per-batch", "16",
+    "--pipeline.model.num-coarse-samples", "8", "--pipeline.model.num-importance-samples", "8",
+    "--machine.device-type", "cpu",
+)  # fmt: skip
+"""Flags of a training that takes a moment."""
 
 
 def tiny_config(**changes: Any) -> NeRFModelConfig:
