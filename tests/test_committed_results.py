@@ -45,6 +45,23 @@ def test_the_readme_quotes_the_committed_results():
     assert readme_row("training memory") == f"{bench['training_memory']['ratio']:.3f} x"
 
 
+def test_the_readme_quotes_the_bench_inside_nerfstudio():
+    told = result("nerfstudio/result.json")
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    for method, cost in told["costs"]["se_against_uniform"].items():
+        ending = f"| {cost['seconds']:.2f} | {cost['bytes']:.2f} |"
+        rows = [line for line in (ROOT / "README.md").read_text().splitlines() if line.endswith(ending)]
+        assert any(f"`{method}`" in row for row in rows), method
+    theirs, ours = (told["failures"][method] for method in ("vanilla-nerf", "edge-se-nerf"))
+    assert sorted({run["seed"] for run in told["runs"]}) == list(range(10))
+    assert (
+        f"`vanilla-nerf` failed in {theirs['failed']} of {theirs['runs']} runs, "
+        f"{theirs['at_background']} of them still at the background, "
+        f"`edge-se-nerf` in {ours['failed']} of {ours['runs']}, {ours['at_background']} at the background; "
+        f"mean PSNR {theirs['mean_psnr']:.2f} and {ours['mean_psnr']:.2f} dB"
+    ) in readme
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", demo.METHODS)
 def test_the_demo_comes_out_again(method: str, tmp_path: Path):

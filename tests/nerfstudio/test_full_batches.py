@@ -173,6 +173,8 @@ def test_patches_are_refused(host_scene: Path, tmp_path: Path) -> None:
         attach(trainer)
 
 
+# its __del__ ends processes that were never started
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_parallel_data_manager_is_refused(host_scene: Path, tmp_path: Path) -> None:
     config = copy.deepcopy(all_methods["nerfacto"])
     parallel = get_origin(config.pipeline.datamanager._target) or config.pipeline.datamanager._target
