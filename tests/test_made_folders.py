@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -187,6 +188,15 @@ def test_a_failure_leaves_nothing_behind(num_train: int, error: type[BaseExcepti
         make_scenes(
             tmp_path / "deep" / "out", ["mic"], size=8, num_train=num_train, num_val=0, num_test=0, progress=fail
         )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    def fail(done: int, total: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(InputError, match="disk is full"):
+        make_scenes(tmp_path / "out", ["mic"], size=8, num_train=1, num_val=0, num_test=0, progress=fail)
     assert list(tmp_path.iterdir()) == []
 
 

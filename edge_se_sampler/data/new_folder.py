@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -32,7 +33,7 @@ def appearing(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
     """A temporary folder inside `out` to write workspace/<name> of every target into; at the end they are moved.
 
     On any exception it goes again, and so does what of `out` was not there. A target that was empty and no longer is
-    raises OSError: nothing is overwritten.
+    raises OSError: nothing is overwritten. A full disk is an InputError.
     """
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
@@ -47,8 +48,10 @@ def appearing(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
                 if target.exists():
                     target.rmdir()  # empty, or this raises
                 (Path(workspace.name) / target.name).rename(target)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):  # someone else's files have come in between: they stay
             for folder in missing:
                 folder.rmdir()
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise InputError(f"out is {out}, whose disk is full: nothing was left there; give another") from error
         raise
