@@ -105,11 +105,11 @@ def experiment(tmp_path: Path) -> Callable[..., dict[str, Any]]:
     return run
 
 
-TODO = [Cell(1, "mic", "vanilla-nerf", 0), Cell(4, "mic", "edge-se-nerf", 1)]
+TWO_CELLS = [Cell(1, "mic", "vanilla-nerf", 0), Cell(4, "mic", "edge-se-nerf", 1)]
 
 
 def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = experiment(TODO[:1])
+    first = experiment(TWO_CELLS[:1])
     assert [(run["table"], run["method"], run["placement"], run["steps"]) for run in first["runs"]] == [
         (1, "nerf", "centered", 4)
     ]
@@ -121,8 +121,8 @@ def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path, mo
         return real(cell, *arguments)
 
     monkeypatch.setattr(running, "run_cell", counted)
-    result = experiment(TODO)
-    assert trained == TODO[1:]
+    result = experiment(TWO_CELLS)
+    assert trained == TWO_CELLS[1:]
     assert json.loads((tmp_path / "out" / "result.json").read_text()) == json.loads(json.dumps(result))
     last = result["runs"][1]
     assert (last["method"], last["placement"], last["steps"], last["seed"]) == ("info-nerf", "shifted", 3, 1)
@@ -132,10 +132,10 @@ def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path, mo
 
 
 def test_a_cell_gives_the_same_result_alone_and_in_another_process(tmp_path: Path) -> None:
-    data_of = running.make_data(SMALL, TODO[:1], tmp_path)
-    own = run_cell(TODO[0], SMALL, data_of(TODO[0]), tmp_path / "a", 1)
+    data_of = running.make_data(SMALL, TWO_CELLS[:1], tmp_path)
+    own = run_cell(TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "a", 1)
     with running.executor_of(1, None)() as executor:
-        other = executor.submit(run_cell, TODO[0], SMALL, data_of(TODO[0]), tmp_path / "b", 1).result()
+        other = executor.submit(run_cell, TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "b", 1).result()
     for key in ("psnr", "loss", "foreground_share"):
         assert own[key] == other[key], key
 
@@ -151,13 +151,13 @@ def test_a_failing_cell_is_told_and_stops_no_other(
         return real(cell, *arguments)
 
     monkeypatch.setattr(running, "run_cell", failing)
-    result = experiment(TODO)
+    result = experiment(TWO_CELLS)
     assert [run["table"] for run in result["runs"]] == [4]
     assert [(e["table"], e["error"]) for e in result["errors"]] == [
         (1, "FloatingPointError: the loss is not finite at step 3")
     ]
     monkeypatch.setattr(running, "run_cell", real)
-    assert len(experiment(TODO)["runs"]) == 2  # the next call tries it again
+    assert len(experiment(TWO_CELLS)["runs"]) == 2  # the next call tries it again
 
 
 def dies_once(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads: int) -> dict[str, Any]:
@@ -171,7 +171,7 @@ def dies_once(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads:
 
 def test_a_killed_worker_costs_no_finished_cell(experiment: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "run_cell", dies_once)
-    result = experiment(TODO, executor=running.executor_of(1, None))
+    result = experiment(TWO_CELLS, executor=running.executor_of(1, None))
     assert len(result["runs"]) == 2
     assert result["errors"] == []
 

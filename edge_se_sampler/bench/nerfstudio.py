@@ -22,13 +22,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from edge_se_sampler.bench.machine import machine, resident_memory
+from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made.folder import make_scenes
-from edge_se_sampler.engine.evaluation import pictures_of, psnr, target_image
+from edge_se_sampler.engine.evaluation import measures, pictures_of
 from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
@@ -104,7 +104,7 @@ def _begun(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _config(method: str, seed: int, data: Path, runs: Path, rays: int) -> Any:
+def host_config(method: str, seed: int, data: Path, runs: Path, rays: int) -> Any:
     """A method's config on the scene."""
     from nerfstudio.configs.method_configs import all_methods
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
@@ -120,22 +120,22 @@ def _config(method: str, seed: int, data: Path, runs: Path, rays: int) -> Any:
     return config
 
 
-def _trainer(config: Any) -> Any:
+def host_trainer(config: Any, test_mode: str) -> Any:
     """nerfstudio's trainer, seeded as ns-train seeds it."""
     random.seed(config.machine.seed)
     torch.manual_seed(config.machine.seed)
     trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup(test_mode="test")
+    trainer.setup(test_mode=test_mode)
     return trainer
 
 
 def _run(method: str, seed: int, data: Path, runs: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Train once, and look at the test views."""
-    config = _config(method, seed, data, runs, settings["rays"])
+    config = host_config(method, seed, data, runs, settings["rays"])
     config.max_num_iterations = settings["iterations"]
     model = config.pipeline.model
     model.num_coarse_samples, model.num_importance_samples = settings["samples"]
-    trainer = _trainer(config)
+    trainer = host_trainer(config, "test")
     began, cpu = time.monotonic(), time.process_time()
     trainer.train()
     seconds, cpu = time.monotonic() - began, time.process_time() - cpu
@@ -147,19 +147,14 @@ def _looked_at(trainer: Any, data: Path) -> dict[str, Any]:
     pipeline = trainer.pipeline
     pipeline.eval()
     cameras = pipeline.datamanager.eval_dataset.cameras.to(pipeline.device)
-    own, background, shares = [], [], []
-    for i, picture in enumerate(pictures_of(read_blender(data, "test"))):
-        rendered = pipeline.model.get_outputs_for_camera(cameras[i : i + 1])["rgb_fine"].cpu().numpy()
-        target = target_image(picture, 1.0)
-        error, white = ((shown - target) ** 2 for shown in (rendered, np.ones_like(target)))
-        object_ = picture.image[..., 3] > 0
-        own.append(psnr(float(error.mean())))
-        background.append(psnr(float(white.mean())))
-        shares.append(float(error[object_].mean() / white[object_].mean()))
+    pictures = pictures_of(read_blender(data, "test"))
+    rendered = [pipeline.model.get_outputs_for_camera(cameras[i : i + 1])["rgb_fine"] for i in range(len(pictures))]
+    rows = [measures(shown.cpu().numpy(), picture, 1.0) for shown, picture in zip(rendered, pictures, strict=True)]
+    background = background_measures(pictures, 1.0)
     return {
-        "psnr": statistics.mean(own),
-        "background_psnr": statistics.mean(background),
-        "foreground_share": statistics.mean(shares),
+        "psnr": statistics.mean(row["psnr"] or 0.0 for row in rows),
+        "background_psnr": statistics.mean(row["psnr"] or 0.0 for row in background),
+        "foreground_share": foreground_share({"images": rows}, background),
     }
 
 
@@ -188,11 +183,11 @@ def costs(data: Path, runs: Path, rays: int, rounds: int = 3) -> dict[str, Any]:
 
 def cost(method: str, late: str, data: str, runs: str, rays: str) -> None:
     """Print what a late step costs: seconds, and peak resident bytes above the level after set-up."""
-    config = _config(method, 0, Path(data), Path(runs), int(rays))
+    config = host_config(method, 0, Path(data), Path(runs), int(rays))
     config.pipeline.datamanager.pixel_sampler.early = "uniform"
     config.pipeline.datamanager.pixel_sampler.late = late
     config.pipeline.datamanager.pixel_sampler.early_fraction = 0.0
-    trainer = _trainer(config)
+    trainer = host_trainer(config, "test")
     before = resident_memory()
     seconds = []
     for step in range(8):
@@ -205,17 +200,15 @@ def cost(method: str, late: str, data: str, runs: str, rays: str) -> None:
 
 
 def _failures(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """For each method, of how many runs: at the background (the error on the object above 0.9 of what the background
-    alone has there), failed (that, or less than 0.5 dB better than the background alone); and the mean PSNR."""
+    """For each method, of how many runs: at the background, and failed at all; and the mean PSNR."""
     told = {}
     for method in METHODS:
         mine = [run for run in runs if run["method"] == method]
-        at_background = [run["foreground_share"] > 0.9 for run in mine]
-        no_better = [run["psnr"] < run["background_psnr"] + 0.5 for run in mine]
+        ends = [outcome(run["psnr"], run["background_psnr"], run["foreground_share"]) for run in mine]
         told[method] = {
             "runs": len(mine),
-            "at_background": sum(at_background),
-            "failed": sum(map(max, at_background, no_better)),
+            "at_background": ends.count("background"),
+            "failed": len(ends) - ends.count("learnt"),
             "mean_psnr": statistics.mean(run["psnr"] for run in mine) if mine else None,
         }
     return told

@@ -19,6 +19,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.tensorboard import EventWriter
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerf.info import InfoNeRFModel
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.streams import Stream, stream
 
@@ -103,7 +104,7 @@ class Trainer:
         loss = self._backward(
             len(rays), lambda rows: model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
         )
-        if model.num_unseen_rays:
+        if isinstance(model, InfoNeRFModel) and model.num_unseen_rays:
             rng = stream(seed, step, Stream.UNSEEN)
             unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, rng)
             loss += self._backward(len(unseen), lambda rows: model.unseen_loss(unseen[rows]))

@@ -86,13 +86,6 @@ class NeRFModel(nn.Module):
         """
         return (outputs[f"rgb_{level}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
-    num_unseen_rays = 0
-    """Rays of poses without an image that a training step wants besides its batch; see `unseen_loss`."""
-
-    def unseen_loss(self, rays: RayBundle) -> Tensor:
-        """(n,) what training minimises the mean of on rays of a pose without an image; here nothing asks for them."""
-        raise NotImplementedError
-
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> Tensor:
         """(n,) what training minimises the mean of on a batch's rays."""
         return self.loss(self(rays), batch)

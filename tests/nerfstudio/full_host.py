@@ -4,14 +4,14 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 import os
-import random
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from edge_se_sampler.bench.nerfstudio import host_config, host_trainer
 
 RAYS = 33
 """Odd, and no divisor of anything."""
@@ -27,18 +27,14 @@ def config_of(
         alpha: the data parser's alpha_color; None leaves RGBA images to the model.
         changes: of the trainer's config.
     """
-    from nerfstudio.configs.method_configs import all_methods
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
-    config = copy.deepcopy(all_methods[name])
+    config = host_config(name, 42, scene, runs, rays)
     config.machine.device_type = "cpu"
-    config.vis = "tensorboard"
     config.max_num_iterations = PLANNED
-    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**6
-    config.output_dir = runs
     manager, model = config.pipeline.datamanager, config.pipeline.model
-    manager.data, manager.dataparser = scene, BlenderDataParserConfig(alpha_color=alpha)
-    manager.train_num_rays_per_batch = manager.eval_num_rays_per_batch = rays
+    manager.dataparser = BlenderDataParserConfig(alpha_color=alpha)
+    manager.eval_num_rays_per_batch = rays
     if hasattr(model, "num_coarse_samples"):
         model.num_coarse_samples = model.num_importance_samples = 8
     else:
@@ -46,17 +42,12 @@ def config_of(
         model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
     for key, value in changes.items():
         setattr(config, key, value)
-    config.set_timestamp()
     return config
 
 
 def trainer_of(config: Any) -> Any:
     """nerfstudio's trainer, set up as `ns-train` does."""
-    random.seed(config.machine.seed)
-    torch.manual_seed(config.machine.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    return host_trainer(config, "val")
 
 
 def max_num_iterations(start: int, more: int) -> int:
