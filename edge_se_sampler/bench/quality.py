@@ -69,8 +69,13 @@ def _draw(path: Path, result: dict[str, Any]) -> None:
     curve = result["curve"]
     axis.plot([line["seconds"] for line in curve], [line["val_psnr"] for line in curve], "o-", color="#d62728", ms=4)
     axis.axhline(result["results"]["psnr"], color="black", ls=":", lw=1)
+    axis.margins(y=0.1)
+    # under its line, on the left, where the curve is still low: above it there may be the title
     label = f"{result['results']['num_images']} test views at the end: {result['results']['psnr']:.2f} dB"
-    axis.annotate(label, (0.02, result["results"]["psnr"]), xycoords=("axes fraction", "data"), va="bottom", fontsize=9)
+    axis.annotate(
+        label, (0.02, result["results"]["psnr"]), xycoords=("axes fraction", "data"), xytext=(0, -4),
+        textcoords="offset points", va="top", fontsize=9,
+    )  # fmt: skip
     title = f"{result['config']['method_name']} on {result['scene']}, {result['machine']['cores']} CPU cores"
     axis.set(xlabel="seconds of training", ylabel="PSNR of a validation view [dB]", title=title)
     axis.grid(alpha=0.25)
