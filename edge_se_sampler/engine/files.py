@@ -73,7 +73,12 @@ def write_image(path: Path, image: np.ndarray) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    write_atomically(path, iio.imwrite("<bytes>", eight_bit(image), extension=".png"))
+    write_atomically(path, png_bytes(image))
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """A picture, (H, W, 3) float in [0, 1], as a PNG file's content."""
+    return iio.imwrite("<bytes>", eight_bit(image), extension=".png")
 
 
 def eight_bit(image: np.ndarray) -> np.ndarray:

@@ -5,31 +5,72 @@ from __future__ import annotations
 import contextlib
 import io
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
-from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
+from edge_se_sampler.bench.outcome import background_measures, dead_networks, foreground_share, outcome
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate, shade_behind
+from edge_se_sampler.engine.files import png_bytes
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf.config import InfoNeRFModelConfig
 
 Method = Literal["nerf", "info-nerf"]
 Placement = Literal["centered", "shifted"]
-TABLES: dict[int, tuple[Method, Placement]] = {
-    1: ("nerf", "centered"),
-    2: ("nerf", "shifted"),
-    3: ("info-nerf", "centered"),
-    4: ("info-nerf", "shifted"),
-}
 FEW_VIEWS = 10
 """InfoNeRF trains on so many."""
+LATE_SE = ("se-nerf", "precrop-se-nerf", "edge-se-nerf")
+
+
+@dataclass(frozen=True)
+class Table:
+    """What the cells of a table have in common."""
+
+    title: str
+    method: Method = "nerf"
+    placement: Placement = "centered"
+    strategies: tuple[str, ...] = STRATEGIES
+    few_views: bool = False
+    steps: float = 1.0
+    """Iterations, as a share of the preset's."""
+    model: dict[str, Any] = field(default_factory=dict)
+    """Settings of the model that differ from the paper's."""
+    sampler: dict[str, Any] = field(default_factory=dict)
+    """Settings of the sampler that differ."""
+
+
+# A step of SE scores twice the rays without gradients: 5 units of work for 3, and with InfoNeRF's as many unseen rays
+# 8 for 6. With a tenth of plain steps, so many steps cost what all steps of Random do.
+RANDOMS_TIME = {"nerf": 1 / (0.1 + 0.9 * 5 / 3), "info-nerf": 1 / (0.1 + 0.9 * 8 / 6)}
+PAPERS: dict[int, Table] = {
+    1: Table("NeRF, all views, centred"),
+    2: Table("NeRF, all views, off centre", placement="shifted"),
+    3: Table("InfoNeRF, 10 views, centred", "info-nerf", few_views=True),
+    4: Table("InfoNeRF, 10 views, off centre", "info-nerf", "shifted", few_views=True),
+}
+TABLES: dict[int, Table] = PAPERS | {
+    5: Table("NeRF, 10 views, centred", few_views=True),
+    6: Table("NeRF, 10 views, off centre", placement="shifted", few_views=True),
+    7: Table("NeRF, all views, centred, torch's initial weights", model={"initialization": "torch"}),
+    8: Table("as 7, off centre", placement="shifted", model={"initialization": "torch"}),
+    **{
+        number + 8: replace(
+            table, title=f"as {number}, in Random's time", strategies=LATE_SE, steps=RANDOMS_TIME[table.method]
+        )
+        for number, table in PAPERS.items()
+    },
+    13: Table("as 1, Laplacian edges", strategies=("edge-nerf",), sampler={"edge_filter": "laplacian"}),
+    14: Table("as 1, softplus density", strategies=("vanilla-nerf",), model={"density_activation": "softplus"}),
+    15: Table("as 2, softplus density", "nerf", "shifted", ("vanilla-nerf",), model={"density_activation": "softplus"}),
+}
+"""The paper's four, and ours."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +81,8 @@ class Preset:
     iterations: int
     info_iterations: int
     rays: int
+    samples: tuple[int, int] | None = None
+    """Coarse and importance samples of a ray; None: the size's."""
     image_size: int | None = None
     """Of made scenes; None: the data is given."""
     num_train: int = 50
@@ -47,10 +90,13 @@ class Preset:
 
 
 PRESETS = {
-    "cpu": Preset("tiny", iterations=400, info_iterations=300, rays=256, image_size=64),
+    "cpu": Preset("tiny", iterations=400, info_iterations=300, rays=128, samples=(24, 16), image_size=64),
     # section 4.1 of the paper: 200,000 iterations, 50,000 for InfoNeRF, 1024 rays
     "paper": Preset("paper", iterations=200_000, info_iterations=50_000, rays=1024),
 }
+
+
+MEASURES = ("psnr", "ssim", "foreground_psnr", "edge_band_psnr", "background_mse")
 
 
 @dataclass(frozen=True)
@@ -71,29 +117,44 @@ class Cell:
 def cells(
     tables: tuple[int, ...], scenes: tuple[str, ...], strategies: tuple[str, ...], seeds: tuple[int, ...]
 ) -> list[Cell]:
-    """All cells asked for, seed by seed, so that an unfinished experiment is a smaller one."""
-    every = product(seeds, tables or tuple(TABLES), scenes or SCENES, strategies or STRATEGIES)
-    return [Cell(table, scene, strategy, seed) for seed, table, scene, strategy in every]
+    """All cells asked for: the paper's seed by seed, then ours, so that an unfinished experiment is a smaller one."""
+    groups = (tuple(PAPERS), tuple(number for number in TABLES if number not in PAPERS))
+    return [
+        Cell(table, scene, strategy, seed)
+        for group in groups
+        for seed, table, scene in product(seeds, group, scenes or SCENES)
+        if not tables or table in tables
+        for strategy in TABLES[table].strategies
+        if not strategies or strategy in strategies
+    ]
 
 
 def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> TrainerConfig:
     """What a cell trains: dense and faithful, nothing culled."""
-    method, _ = TABLES[cell.table]
+    table = TABLES[cell.table]
     config = registered_methods()[cell.strategy].specification.config
-    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=preset.rays)
-    model = InfoNeRFModelConfig() if method == "info-nerf" else config.pipeline.model
-    iterations = preset.info_iterations if method == "info-nerf" else preset.iterations
+    manager = config.pipeline.datamanager
+    sampler = replace(manager.pixel_sampler, **table.sampler)
+    manager = replace(manager, train_num_rays_per_batch=preset.rays, pixel_sampler=sampler)
+    info = table.method == "info-nerf"
+    model = InfoNeRFModelConfig() if info else config.pipeline.model
+    if preset.samples is not None:
+        coarse, importance = preset.samples
+        model = replace(model, num_coarse_samples=coarse, num_importance_samples=importance)
+    model = replace(model, size=preset.size, **table.model)
+    iterations = round(table.steps * (preset.info_iterations if info else preset.iterations))
     return replace(
         config,
         data=data,
         output_dir=output_dir,
         experiment_name=cell.name,
-        num_views=FEW_VIEWS if method == "info-nerf" else None,
+        num_views=FEW_VIEWS if table.few_views else None,
         max_num_iterations=iterations,
         steps_per_save=iterations,
+        steps_per_eval_image=iterations,
         steps_per_log=max(1, iterations // 100),
         machine=MachineConfig(seed=cell.seed, device_type="auto"),
-        pipeline=replace(config.pipeline, datamanager=manager, model=replace(model, size=preset.size)),
+        pipeline=replace(config.pipeline, datamanager=manager, model=model),
     )
 
 
@@ -101,32 +162,36 @@ def run_cell(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads: 
     """Train a cell and measure it; runs in a process of its own.
 
     Returns:
-        its place, psnr and the other measures, outcome, seconds, CPU seconds, steps, and the training loss's curve.
+        its place, psnr and the other measures, outcome, which networks were dead before the first step, seconds, CPU
+        seconds, steps, the curve of the training loss, and `view`, a held-out view as PNG.
     """
     torch.set_num_threads(threads)
     with contextlib.redirect_stderr(io.StringIO()):  # its progress: several cells write to one terminal
         trainer = prepare(config_of(cell, preset, data, output_dir))
+        pictures, model = test_pictures(trainer.config), trainer.pipeline.model
+        dead = dead_networks(model, pictures)
         began = time.process_time()
         trainer.train()
     cpu_seconds = time.process_time() - began
     if trainer.stop_requested:
         raise KeyboardInterrupt
-    pictures, model = test_pictures(trainer.config), trainer.pipeline.model
-    results = evaluate(model, pictures)
+    views: list[np.ndarray] = []
+    results = evaluate(model, pictures, lambda _, __, rendered: views.append(rendered))
     background = background_measures(pictures, shade_behind(model))
     background_psnr = sum(alone["psnr"] or 0.0 for alone in background) / len(background)
     share = foreground_share(results, background)
-    method, placement = TABLES[cell.table]
     return {
         **asdict(cell),
-        "method": method,
-        "placement": placement,
-        **{key: results[key] for key in ("psnr", "ssim", "foreground_psnr", "edge_band_psnr", "background_mse")},
+        "method": TABLES[cell.table].method,
+        "placement": TABLES[cell.table].placement,
+        **{key: results[key] for key in MEASURES},
         "background_psnr": background_psnr,
         "foreground_share": share,
         "outcome": outcome(results["psnr"], background_psnr, share),
+        "dead_at_start": dead,
         "steps": trainer.next_step,
-        "seconds": trainer.elapsed,
-        "cpu_seconds": cpu_seconds,
-        "loss": [[line["step"], line["loss"]] for line in trainer.run.metrics() if "loss" in line],
+        "seconds": round(trainer.elapsed, 3),
+        "cpu_seconds": round(cpu_seconds, 3),
+        "loss": [[line["step"], float(f"{line['loss']:.4g}")] for line in trainer.run.metrics() if "loss" in line],
+        "view": png_bytes(views[0]),
     }

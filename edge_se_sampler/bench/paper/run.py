@@ -14,7 +14,7 @@ from typing import Any
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.bench.paper.cell import TABLES, Cell, Placement, Preset, run_cell
 from edge_se_sampler.data.made.folder import make_scenes
-from edge_se_sampler.engine.files import write_json
+from edge_se_sampler.engine.files import make_folder, write_atomically, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 
@@ -45,10 +45,10 @@ def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
 
 def make_data(preset: Preset, cells: list[Cell], workplace: Path) -> Callable[[Cell], Path]:
     """The made scenes that the cells need, off-centre ones the centred pictures pasted elsewhere; where each lies."""
-    placements: list[Placement] = sorted({TABLES[cell.table][1] for cell in cells})
+    placements: list[Placement] = sorted({TABLES[cell.table].placement for cell in cells})
     for placement in placements:
         folder = workplace / "scenes" / placement
-        wanted = {cell.scene for cell in cells if TABLES[cell.table][1] == placement}
+        wanted = {cell.scene for cell in cells if TABLES[cell.table].placement == placement}
         missing = sorted(name for name in wanted if not (folder / name).exists())
         if missing:
             progress = Progress(len(missing) * (preset.num_train + 1 + preset.num_test), f"making {placement} scenes")
@@ -57,7 +57,7 @@ def make_data(preset: Preset, cells: list[Cell], workplace: Path) -> Callable[[C
                 num_test=preset.num_test, placement=placement, progress=lambda done, _, bar=progress: bar.update(done),
             )  # fmt: skip
             progress.close()
-    return lambda cell: workplace / "scenes" / TABLES[cell.table][1] / cell.scene
+    return lambda cell: workplace / "scenes" / TABLES[cell.table].placement / cell.scene
 
 
 def begun(path: Path, preset: Preset) -> dict[str, Any]:
@@ -97,6 +97,7 @@ def run_cells(
     """
     path = output_dir / "result.json"
     result = begun(path, preset)
+    make_folder(output_dir / "views", "--output-dir, folder")
     result["errors"] = []
     progress = Progress(len(cells), "bench paper", start=len(cells) - len(_missing(cells, result)))
     for _ in range(BROKEN_POOLS):
@@ -110,7 +111,7 @@ def run_cells(
             }
             try:
                 for future in as_completed(place):
-                    _take(result, place[future], future.exception(), future)
+                    _take(result, place[future], future.exception(), future, output_dir / "views")
                     write_json(path, result)
                     progress.update(len(cells) - len(_missing(cells, result)))
             except BrokenExecutor:
@@ -124,12 +125,14 @@ def run_cells(
     return result
 
 
-def _take(result: dict[str, Any], cell: Cell, problem: BaseException | None, future: Any) -> None:
-    """A finished cell into the result."""
+def _take(result: dict[str, Any], cell: Cell, problem: BaseException | None, future: Any, views: Path) -> None:
+    """A finished cell into the result, its view beside it."""
     if isinstance(problem, (BrokenExecutor, KeyboardInterrupt)):
         raise problem
     if problem is None:
-        result["runs"].append(future.result())
+        run = future.result()
+        write_atomically(views / f"{cell.name}.png", run.pop("view"))
+        result["runs"].append(run)
         result["runs"].sort(key=lambda run: (run["table"], run["scene"], run["strategy"], run["seed"]))
     else:
         result["errors"].append({**asdict(cell), "error": f"{type(problem).__name__}: {problem}"})
