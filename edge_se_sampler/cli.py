@@ -55,10 +55,11 @@ class Scenes:
     """Validation views."""
     num_test: int = 10
     """Test views."""
-    placement: Literal["centered", "shifted", "rotated"] = "centered"
-    """Object in the middle; moved in the image plane (cx, cy in the json); or cameras turned away from it."""
+    placement: Literal["centered", "padded", "shifted", "rotated"] = "centered"
+    """Object in the middle; as small there as shifted has it; moved in the image plane (cx, cy in the json); or
+    cameras turned away from it."""
     offset: tuple[float, float] = (0.2, 0.15)
-    """Where the object goes from the middle, right and down, as fractions of the image (shifted, rotated)."""
+    """Where the object goes from the middle, right and down, as fractions of the image (all but centered)."""
     seed: int = 0
     """Of the training and validation poses."""
 

@@ -67,16 +67,17 @@ def test_test_cameras_are_spread() -> None:
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_shifted_is_the_centred_picture_pasted(name: str) -> None:
+def test_shifted_and_padded_are_the_centred_picture_pasted(name: str) -> None:
     scene = made_scene(name)
     pose = poses("train", 2)[1]
-    size, dx, dy, frame = 40, 8, -6, 24
-    pasted = np.zeros((size, size, 4), dtype=np.uint8)
-    top, left = (size - frame) // 2 + dy, (size - frame) // 2 + dx
-    pasted[top : top + frame, left : left + frame] = render(scene, framing(frame).camera(pose))
-    shifted = render(scene, framing(size, "shifted", OFFSET).camera(pose))
-    np.testing.assert_array_equal(shifted, pasted)
-    assert (shifted[..., 3] > 0).any()
+    size, frame = 40, 24
+    for placement, dx, dy in (("shifted", 8, -6), ("padded", 0, 0)):
+        pasted = np.zeros((size, size, 4), dtype=np.uint8)
+        top, left = (size - frame) // 2 + dy, (size - frame) // 2 + dx
+        pasted[top : top + frame, left : left + frame] = render(scene, framing(frame).camera(pose))
+        placed = render(scene, framing(size, placement, OFFSET).camera(pose))
+        np.testing.assert_array_equal(placed, pasted)
+        assert (placed[..., 3] > 0).any()
 
 
 @pytest.mark.parametrize("size", [40, 41, 100])

@@ -36,7 +36,7 @@ def everything_below(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in files}
 
 
-@pytest.mark.parametrize("placement", ["centered", "shifted", "rotated"])
+@pytest.mark.parametrize("placement", ["centered", "padded", "shifted", "rotated"])
 def test_folder_tells_the_truth(placement: Placement, tmp_path: Path) -> None:
     """Every picture is what its json says, read as any loader of Blender scenes reads it."""
     size = 24

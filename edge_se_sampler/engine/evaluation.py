@@ -101,6 +101,13 @@ def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
     return float(np.mean(score[:3]))
 
 
+def edge_band(image: np.ndarray) -> np.ndarray:
+    """Where an image (H, W, 3) has its strongest edges and their neighbours, (H, W) bool."""
+    edges = edge_strength(image)
+    band = edges >= max(float(np.quantile(edges, 1 - EDGE_BAND_SHARE)), 1e-6)
+    return cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
 def measures(rendered: np.ndarray, picture: Picture, shade: float) -> dict[str, float | None]:
     """All measures of one view; None where there is nothing to measure (no alpha, no foreground).
 
@@ -109,9 +116,7 @@ def measures(rendered: np.ndarray, picture: Picture, shade: float) -> dict[str, 
     """
     target = target_image(picture, shade)
     error = ((rendered.astype(np.float64) - target) ** 2).mean(axis=2)
-    edges = edge_strength(target)
-    band = edges >= max(float(np.quantile(edges, 1 - EDGE_BAND_SHARE)), 1e-6)
-    band = cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    band = edge_band(target)
     result = {
         "mse": float(error.mean()),
         "psnr": psnr(error.mean()),

@@ -24,7 +24,7 @@ FIELD_OF_VIEW = 0.6911112070083618  # radians, as in NeRF's Blender scenes
 DISTANCE = 4.031128874149275  # of the cameras from the origin, world units; likewise
 SMALLEST_FRAME = 8  # pixels; in less an object is a blot
 
-Placement = Literal["centered", "shifted", "rotated"]
+Placement = Literal["centered", "padded", "shifted", "rotated"]
 Split = Literal["train", "val", "test"]
 
 _SEED_OFFSET = {"train": 0, "val": 2**31}  # apart by more than any seed, so no seed's val is another's train
@@ -88,7 +88,8 @@ class Framing:
 def framing(size: int, placement: Placement = "centered", offset: tuple[float, float] = (0.0, 0.0)) -> Framing:
     """Places the object `offset` (right, down; shares of the image's side) from the middle of size x size pixels.
 
-    "centered" ignores the offset; "shifted" moves the principal point, "rotated" turns the cameras.
+    "centered" ignores the offset; "padded" only makes room for it; "shifted" moves the principal point, "rotated"
+    turns the cameras.
 
     Raises InputError if `size` is below 8, the placement is unknown, or the offset leaves the object a frame of
     fewer than 8 pixels.

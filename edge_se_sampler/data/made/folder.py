@@ -60,8 +60,9 @@ def make_scenes(
 
     `placement` puts the object `offset` (right, down; shares of `size`) from the middle: "centered" ignores the
     offset; "shifted" shows the centred picture of a smaller frame, pasted whole pixels away, and says so by `cx`
-    and `cy` (pixels) in the json; "rotated" turns the cameras until the world's origin is at the same pixel, which
-    every loader reads, but perspective stretches the object.
+    and `cy` (pixels) in the json; "padded" pastes that picture in the middle, so that only the place differs;
+    "rotated" turns the cameras until the world's origin is at the same pixel, which every loader reads, but
+    perspective stretches the object.
 
     `progress(done, total)` counts views. More than a few views render in os.cpu_count() fresh processes, so a script
     that calls this needs the usual `if __name__ == "__main__":` guard.
