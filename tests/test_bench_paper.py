@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
 from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
+from edge_se_sampler.bench.paper import estimate
 from edge_se_sampler.bench.paper import run as running
-from edge_se_sampler.bench.paper.cell import PRESETS, Cell, Preset, cells, config_of, run_cell
+from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, TABLES, Cell, Preset, cells, config_of, run_cell
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES, published
-from edge_se_sampler.bench.paper.tables import tables_of
+from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
 from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.made.folder import make_scenes
 from edge_se_sampler.engine.evaluation import measures, pictures_of
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerf.config import InfoNeRFModelConfig
@@ -27,10 +31,11 @@ SMALL = Preset("tiny", iterations=4, info_iterations=3, rays=16, image_size=16, 
 
 
 def test_there_are_168_cells_a_seed() -> None:
-    every = cells((), (), (), (0, 1, 2))
+    every = cells(tuple(PAPERS), (), (), (0, 1, 2))
     assert len(every) == len(set(every)) == 3 * 168
     assert [cell.seed for cell in every] == [0] * 168 + [1] * 168 + [2] * 168
     assert len({cell.name for cell in every}) == len(every)
+    assert cells((), (), (), (0, 1, 2))[: 3 * 168] == every  # the paper's first
     assert cells((3,), ("mic",), ("edge-nerf",), (7,)) == [Cell(3, "mic", "edge-nerf", 7)]
 
 
@@ -43,6 +48,21 @@ def test_a_cell_trains_its_strategy_on_its_method(table: int, few: bool, tmp_pat
     assert config.num_views == (10 if few else None)
     assert config.machine.seed == 5
     assert config.pipeline.model.initialization == "xavier"
+
+
+def test_our_tables_change_what_they_say() -> None:
+    def config(table: int, strategy: str) -> Any:
+        return config_of(Cell(table, "mic", strategy, 0), PRESETS["cpu"], Path("d"), Path("o"))
+
+    assert config(5, "se-nerf").num_views == 10
+    assert config(6, "se-nerf").pipeline.model == config(2, "se-nerf").pipeline.model
+    assert config(7, "edge-nerf").pipeline.model.initialization == "torch"
+    assert config(13, "edge-nerf").pipeline.datamanager.pixel_sampler.edge_filter == "laplacian"
+    assert config(15, "vanilla-nerf").pipeline.model.density_activation == "softplus"
+    # 5 units of work for 3 in nine tenths of the steps, 8 for 6 with unseen rays
+    assert config(9, "edge-se-nerf").max_num_iterations == config(1, "edge-se-nerf").max_num_iterations / 1.6
+    assert config(12, "edge-se-nerf").max_num_iterations == round(PRESETS["cpu"].info_iterations / 1.3)
+    assert {TABLES[number].placement for number in (2, 6, 8, 10, 15)} == {"shifted"}
 
 
 def test_the_published_tables_are_the_papers() -> None:
@@ -97,7 +117,7 @@ def experiment(tmp_path: Path) -> Callable[..., dict[str, Any]]:
     """Run cells of the small preset, in threads of this process."""
 
     def run(todo: list[Cell], **changes: Any) -> dict[str, Any]:
-        data_of = running.make_data(SMALL, todo, tmp_path / "w")
+        data_of = made_scenes(SMALL, todo, tmp_path / "w")
         (tmp_path / "out").mkdir(exist_ok=True)
         executor = changes.pop("executor", lambda: ThreadPoolExecutor(1))
         return running.run_cells(todo, SMALL, data_of, tmp_path / "out", tmp_path / "w", executor, threads=1)
@@ -128,11 +148,14 @@ def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path, mo
     assert (last["method"], last["placement"], last["steps"], last["seed"]) == ("info-nerf", "shifted", 3, 1)
     assert last["outcome"] in ("learnt", "slow", "background")
     assert 0 < last["psnr"] < 100
-    assert [step for step, _ in last["loss"]] == [0, 1, 2]
+    assert (last["loss_every"], len(last["loss"])) == (1, 3)
+    assert last["dead_at_start"] == []
+    view = iio.imread(tmp_path / "out" / "views" / f"{TWO_CELLS[1].name}.png")
+    assert view.shape == (16, 16, 3)
 
 
 def test_a_cell_gives_the_same_result_alone_and_in_another_process(tmp_path: Path) -> None:
-    data_of = running.make_data(SMALL, TWO_CELLS[:1], tmp_path)
+    data_of = made_scenes(SMALL, TWO_CELLS[:1], tmp_path)
     own = run_cell(TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "a", 1)
     with running.executor_of(1, None)() as executor:
         other = executor.submit(run_cell, TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "b", 1).result()
@@ -166,7 +189,7 @@ def dies_once(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads:
     if cell.table == 1 and not mark.exists():
         mark.touch()
         os._exit(9)
-    return {**vars(cell), "psnr": 30.0, "outcome": "learnt"}
+    return {**vars(cell), "psnr": 30.0, "outcome": "learnt", "view": b""}
 
 
 def test_a_killed_worker_costs_no_finished_cell(experiment: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,37 +216,72 @@ def test_a_result_of_another_preset_is_refused(tmp_path: Path) -> None:
         running.begun(path, replace(SMALL, rays=17))
 
 
-# -- tables
-
-
-def test_the_tables_tell_mean_deviation_and_failures() -> None:
-    def run(strategy: str, seed: int, psnr: float, what: str = "learnt") -> dict[str, Any]:
-        return {"table": 2, "scene": "mic", "strategy": strategy, "seed": seed, "psnr": psnr, "outcome": what}
-
-    runs = [run("vanilla-nerf", 0, 20.0, "background"), run("vanilla-nerf", 1, 24.0), run("edge-nerf", 0, 30.0)]
-    text = tables_of({"runs": runs})
-    assert "| Random | 22.00 ± 2.83 ✗1/2 <sub>13.12</sub> |" in text
-    assert "| Edge | 30.00 <sub>29.38</sub> |" in text
-    assert "Table 1" not in text
-    assert "Precrop" not in text
-
-
 # -- the command line
 
 
 def test_the_command_runs_a_subset(tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "cpu", SMALL)
-    flags = ["--tables", 2, "--scenes", "mic", "--strategies", "edge-nerf", "--seeds", 0, "--workers", 1]
-    places = ["--output-dir", tmp_path / "new" / "out", "--workplace", tmp_path / "w"]
-    answer = edge_se("bench", "paper", *places, *flags)
+    out = tmp_path / "new" / "out"
+    flags = ["--scenes", "chair", "--strategies", "vanilla-nerf", "precrop-nerf", "edge-nerf", "--seeds", 0]
+    places = ["--output-dir", out, "--workplace", tmp_path / "w", "--workers", 2]
+    answer = edge_se("bench", "paper", *places, "--tables", 1, 2, *flags)
     assert answer.code == 0, answer
-    assert "| Edge |" in (tmp_path / "new" / "out" / "tables.md").read_text()
+    text = (out / "tables.md").read_text()
+    assert "| Edge |" in text
+    assert "Edge against Precrop + Random, table 1" in text
+    assert {path.name for path in out.iterdir()} == {
+        "result.json", "tables.md", "report.html", "views", "sheet.png", "figure-5.png", "figure-6.png",
+    }  # fmt: skip
+    page = (out / "report.html").read_text()
+    for promised in ("Where the object is centred", "data:image/png;base64", "Table 2", "figure 6"):
+        assert promised in page
+    assert 'src="http' not in page
+    assert "href" not in page  # stands alone
+    result = json.loads((out / "result.json").read_text())
+    assert [claim["verdict"] for claim in result["verdicts"]] == ["undecided"] * 3
+
+
+def test_a_dry_run_trains_and_writes_nothing(tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PRESETS, "cpu", SMALL)
+    answer = edge_se("bench", "paper", "--output-dir", tmp_path / "o", "--tables", 1, 4, "--dry-run", "--workers", 3)
+    assert answer.code == 0, answer
+    lines = answer.out.splitlines()
+    assert re.match(r"table  1: +126 cells of 4 steps, +\d+ seconds  NeRF, all views, centred", lines[0])
+    assert re.match(r"table  4: +126 cells of 3 steps", lines[1])
+    assert lines[2].startswith("252 cells, 0 done before; all of them train for about ")
+    assert lines[2].endswith("with 3 at once, scenes and evaluation not counted")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_estimate_follows_what_a_step_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "_step_seconds", lambda method, preset: 3600.0)
+    for strategy, table, hours in (("edge-nerf", 1, 4), ("edge-se-nerf", 1, 6.4), ("edge-se-nerf", 3, 3.9)):
+        plan = estimate.plan_of([Cell(table, "mic", strategy, 0)], 0, SMALL, 1)
+        assert f"{hours:.1f} hours" in plan, plan
+
+
+def test_real_data_and_its_counterparts(tmp_path: Path) -> None:
+    """A folder as NeRF-synthetic has them: centred cells take it as it is, the others what offcenter makes of it."""
+    todo = [Cell(1, "bricks", "edge-nerf", 0), Cell(2, "bricks", "edge-nerf", 0), Cell(16, "bricks", "edge-nerf", 0)]
+    (made,) = make_scenes(tmp_path / "made", ["bricks"], size=20, num_train=2, num_val=0, num_test=1)
+    (tmp_path / "real").mkdir()
+    made.rename(tmp_path / "real" / "lego")
+    check_real(tmp_path / "real", todo)
+    data_of = real_scenes(tmp_path / "real", todo, tmp_path / "w")
+    assert data_of(todo[0]) == tmp_path / "real" / "lego"
+    shifted, padded = (read_blender(data_of(cell), "train") for cell in todo[1:])
+    assert shifted.images[0].shape == padded.images[0].shape == (26, 28, 4)
+    assert shifted.principal[0].tolist() == [18, 16]
+    assert padded.principal[0].tolist() == [14, 13]
 
 
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--tables", "5"), "--tables: 5 is none of 1, 2, 3, 4"),
+        (("--tables", "99"), "--tables: 99 is none of 1, 2, 3, 4"),
+        (("--preset", "paper"), "--preset paper needs --data"),
+        (("--data", "somewhere"), "--preset paper needs --data"),
+        (("--preset", "paper", "--data", "/nowhere"), "--data /nowhere: chair/transforms_train.json is missing"),
         (("--scenes", "lego"), "--scenes: 'lego'"),
         (("--strategies", "edge"), "--strategies: 'edge'"),
         (("--workers", "0"), "at least one"),

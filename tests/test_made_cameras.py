@@ -71,7 +71,8 @@ def test_shifted_and_padded_are_the_centred_picture_pasted(name: str) -> None:
     scene = made_scene(name)
     pose = poses("train", 2)[1]
     size, frame = 40, 24
-    for placement, dx, dy in (("shifted", 8, -6), ("padded", 0, 0)):
+    places: list[tuple[Placement, int, int]] = [("shifted", 8, -6), ("padded", 0, 0)]
+    for placement, dx, dy in places:
         pasted = np.zeros((size, size, 4), dtype=np.uint8)
         top, left = (size - frame) // 2 + dy, (size - frame) // 2 + dx
         pasted[top : top + frame, left : left + frame] = render(scene, framing(frame).camera(pose))

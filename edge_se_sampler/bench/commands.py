@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
+
+import tyro
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
@@ -98,31 +101,41 @@ class BenchNerfstudio:
 
 @dataclass(frozen=True)
 class BenchPaper:
-    """Remake the paper's tables 1 to 4 on made scenes; leave result.json and tables.md. Goes on where it was ended."""
+    """Remake the paper's tables and figures, and judge its claims; leave result.json, tables.md, pictures and
+    report.html. Goes on where it was ended."""
 
     output_dir: Path
     """Where the result goes; cells that it already has are kept."""
+    preset: Literal["cpu", "paper"] = "cpu"
+    """Made scenes, small enough for a CPU; or the paper's own size, for --data."""
+    data: Path | None = None
+    """A NeRF-synthetic folder (chair, drums, ficus, hotdog, lego, materials, mic), for --preset paper."""
     workplace: Path = Path("bench")
     """Where scenes and runs are kept; workers on other machines must see it."""
     tables: tuple[int, ...] = ()
-    """Of 1 to 4; none: all. 1, 2: NeRF with all views; 3, 4: InfoNeRF with 10; 2, 4: off centre."""
+    """The paper's 1 to 4, ours from 5; none: all. --dry-run tells what they are."""
     scenes: tuple[str, ...] = ()
-    """Of the seven made scenes; none: all."""
+    """Of the seven, Lego under the name bricks; none: all."""
     strategies: tuple[str, ...] = ()
     """Of the paper's six, under the methods' names; none: all."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of weights, pixels and jitter."""
     workers: int | None = None
-    """Cells trained at once, a thread each; left out, as many as there are cores."""
+    """Cells trained at once, a thread each; left out, as many as there are cores, or one where there is a GPU."""
     scheduler: str | None = None
     """Address of a dask scheduler whose workers take the cells ([cluster] extra), instead of --workers."""
+    dry_run: tyro.conf.UseCounterAction[int] = 0
+    """Only tell which cells there are and how long they will take; trains nothing, writes nothing."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells
+        from edge_se_sampler.bench.paper.estimate import plan_of
+        from edge_se_sampler.bench.paper.outputs import write_outputs
         from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
-        from edge_se_sampler.bench.paper.run import cores, executor_of, make_data, run_cells
-        from edge_se_sampler.bench.paper.tables import tables_of
-        from edge_se_sampler.engine.files import make_folder, write_atomically
+        from edge_se_sampler.bench.paper.run import begun, default_workers, executor_of, missing, run_cells
+        from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
+        from edge_se_sampler.engine.files import make_folder
+        from edge_se_sampler.show import require_pyplot
 
         for flag, chosen, known in (
             ("tables", self.tables, tuple(TABLES)),
@@ -134,16 +147,29 @@ class BenchPaper:
                     raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
         if not self.seeds or (self.workers is not None and self.workers < 1):
             raise InputError("--seeds and --workers: at least one")
-        preset = PRESETS["cpu"]
+        if (self.data is None) != (self.preset == "cpu"):
+            raise InputError("--preset paper needs --data, a NeRF-synthetic folder; --preset cpu makes its scenes")
+        preset = PRESETS[self.preset]
         todo = cells(self.tables, self.scenes, self.strategies, self.seeds)
-        new_executor = executor_of(self.workers or cores(), self.scheduler)
+        workers = self.workers or default_workers()
+        if self.data is not None:
+            check_real(self.data, todo)
+        before = begun(self.output_dir / "result.json", preset)
+        if self.dry_run:
+            print(plan_of(todo, len(todo) - len(missing(todo, before)), preset, workers))
+            return
+        require_pyplot()
+        new_executor = executor_of(workers, self.scheduler)
         make_folder(self.output_dir, "--output-dir")
-        data_of = make_data(preset, todo, self.workplace)
+        if self.data is None:
+            data_of = made_scenes(preset, todo, self.workplace)
+        else:
+            data_of = real_scenes(self.data, todo, self.workplace)
         result = run_cells(todo, preset, data_of, self.output_dir, self.workplace, new_executor, threads=1)
-        write_atomically(self.output_dir / "tables.md", tables_of(result).encode())
+        write_outputs(result, data_of, self.output_dir)
         for error in result["errors"]:
             print(f"table {error['table']}, {error['scene']}, {error['strategy']}, {error['seed']}: {error['error']}")
-        print(f"{len(result['runs'])} cells; see {self.output_dir / 'tables.md'}")
+        print(f"{len(result['runs'])} cells; see {self.output_dir / 'report.html'}")
 
 
 BENCHES: dict[str, type] = {

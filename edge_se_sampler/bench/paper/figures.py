@@ -89,6 +89,12 @@ def _show(axis: Any, image: np.ndarray | None, frame: str | None = None, **more:
         axis.imshow(image, interpolation="nearest", **more)
 
 
+def _outline(axis: Any, window: tuple[slice, slice]) -> None:
+    """A red rectangle around a window's pixels."""
+    (top, bottom), (left, right) = ((part.start - 0.5, part.stop - 0.5) for part in window)
+    axis.plot([left, right, right, left, left], [top, top, bottom, bottom, top], color=FAILED, lw=1.5)
+
+
 def _sheet(experiment: Experiment) -> Any:
     """Tables 1 to 4 in pictures: what failed has a red frame."""
     scenes = [scene for scene in SCENES if any(run["scene"] == scene for run in experiment.runs)]
@@ -97,7 +103,7 @@ def _sheet(experiment: Experiment) -> Any:
         return None
     width, height = 0.62 * len(scenes) + 1.3, 0.62 * (len(STRATEGIES) + 1) + 0.6
     figure = require_pyplot().figure(figsize=(width * min(2, len(tables)), height * -(-len(tables) // 2)))
-    parts = np.atleast_1d(figure.subfigures(-(-len(tables) // 2), min(2, len(tables)))).ravel()
+    parts = np.ravel(figure.subfigures(-(-len(tables) // 2), min(2, len(tables)), squeeze=False))
     for part, number in zip(parts, tables, strict=False):
         part.suptitle(f"Table {number}: {TABLES[number].title}", fontsize=10)
         axes = part.subplots(
@@ -132,17 +138,12 @@ def _figure_2(experiment: Experiment) -> Any:
         height, width = image.shape[:2]
         window = (slice(height // 4, 3 * height // 4), slice(width // 4, 3 * width // 4))
         _show(column[0], _on_white(image))
-        column[0].add_patch(
-            require_pyplot().Rectangle(
-                (width / 4 - 0.5, height / 4 - 0.5), width / 2, height / 2, fill=False, color=FAILED, lw=1.5
-            )
-        )
+        _outline(column[0], window)
         column[0].set_title(f"{scene}, {titles[table]}", fontsize=9)
         if image.shape[2] == 4:
             inside = (image[(*window, 3)] > 0).mean()
             column[0].set_xlabel(f"{inside:.0%} of the window is object", fontsize=8)
-        run = experiment.run(table, scene, "precrop-nerf")
-        assert run is not None
+        run = experiment.run(table, scene, "precrop-nerf") or {}
         _show(column[1], experiment.rendering(table, scene, "precrop-nerf"), FAILED if failed(run) else "#cccccc")
         column[1].set_xlabel(f"Precrop: {run['psnr']:.2f} dB (background {run['background_psnr']:.2f})", fontsize=8)
     figure.tight_layout()
@@ -160,15 +161,16 @@ def _figure_5(experiment: Experiment) -> Any:
     )
     for row, table in zip(axes, tables, strict=True):
         for axis, scene in zip(row, scenes, strict=True):
+            steps = np.zeros(1)
             for strategy, color in COLORS.items():
                 mine = [
                     r for r in experiment.runs if (r["table"], r["scene"], r["strategy"]) == (table, scene, strategy)
                 ]
                 for i, run in enumerate(mine):
-                    steps, losses = np.array(run["loss"]).T
-                    label = LABEL[strategy] if i == 0 else None
-                    axis.plot(steps, _median_of_neighbours(losses), color=color, lw=1, alpha=0.8, label=label)
-            axis.axvline(mine[0]["steps"] / 10, color="black", ls=":", lw=1)
+                    losses = _median_of_neighbours(np.array(run["loss"]))
+                    steps = run["loss_every"] * np.arange(len(losses))
+                    axis.plot(steps, losses, color=color, lw=1, alpha=0.8, label=LABEL[strategy] if i == 0 else None)
+            axis.axvline(steps[-1] / 10, color="black", ls=":", lw=1)
             axis.set(yscale="log", title=f"{scene}, {'centred' if table == 1 else 'off centre'}")
             axis.title.set_fontsize(10)
             axis.grid(alpha=0.25)
@@ -184,8 +186,8 @@ def _figure_5(experiment: Experiment) -> Any:
 
 def _median_of_neighbours(values: np.ndarray, reach: int = 3) -> np.ndarray:
     """A step trains on one image, and images differ: the middle of seven steps."""
-    padded = np.pad(values, reach, mode="edge")
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
+    padded = np.pad(values, reach, constant_values=np.nan)
+    return np.nanmedian(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
 
 
 def _figure_6(experiment: Experiment) -> Any:
@@ -198,13 +200,11 @@ def _figure_6(experiment: Experiment) -> Any:
     for rows, scene in zip(axes.reshape(len(scenes), 2, 4), scenes, strict=True):
         truth = experiment.truth(1, scene)
         band, window = edge_band(truth), _busiest(truth)
-        pictures = {"truth": truth} | {LABEL[arm]: experiment.rendering(1, scene, arm) for arm in arms}
+        pictures = {"truth": truth} | {LABEL[arm]: _there(experiment.rendering(1, scene, arm)) for arm in arms}
         for axis, (label, picture) in zip(rows[0], pictures.items(), strict=False):
             _show(axis, picture)
             axis.set_title(f"{scene}: {label}" if axis is rows[0][0] else label, fontsize=9)
-            top, left = window[0].start, window[1].start
-            side = window[0].stop - top
-            axis.add_patch(require_pyplot().Rectangle((left - 0.5, top - 0.5), side, side, fill=False, color=FAILED))
+            _outline(axis, window)
         _show(rows[0][3], np.where(band, 0.0, 1.0), cmap="gray", vmin=0, vmax=1)
         rows[0][3].set_title("edge band", fontsize=9)
         errors = {a: ((pictures[LABEL[a]] - truth) ** 2).mean(axis=2) for a in arms}
@@ -220,6 +220,11 @@ def _figure_6(experiment: Experiment) -> Any:
             axis.set_title(f"{label}, the crop", fontsize=9)
     figure.tight_layout()
     return figure
+
+
+def _there(picture: np.ndarray | None) -> np.ndarray:
+    assert picture is not None
+    return picture
 
 
 def _busiest(image: np.ndarray) -> tuple[slice, slice]:

@@ -11,10 +11,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.bench.paper.cell import TABLES, Cell, Placement, Preset, run_cell
-from edge_se_sampler.data.made.folder import make_scenes
-from edge_se_sampler.engine.files import make_folder, write_atomically, write_json
+from edge_se_sampler.bench.paper.cell import Cell, Preset, run_cell
+from edge_se_sampler.engine.files import make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 
@@ -43,23 +44,6 @@ def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
     return client.get_executor
 
 
-def make_data(preset: Preset, cells: list[Cell], workplace: Path) -> Callable[[Cell], Path]:
-    """The made scenes that the cells need, off-centre ones the centred pictures pasted elsewhere; where each lies."""
-    placements: list[Placement] = sorted({TABLES[cell.table].placement for cell in cells})
-    for placement in placements:
-        folder = workplace / "scenes" / placement
-        wanted = {cell.scene for cell in cells if TABLES[cell.table].placement == placement}
-        missing = sorted(name for name in wanted if not (folder / name).exists())
-        if missing:
-            progress = Progress(len(missing) * (preset.num_train + 1 + preset.num_test), f"making {placement} scenes")
-            make_scenes(
-                folder, missing, size=preset.image_size or 800, num_train=preset.num_train, num_val=1,
-                num_test=preset.num_test, placement=placement, progress=lambda done, _, bar=progress: bar.update(done),
-            )  # fmt: skip
-            progress.close()
-    return lambda cell: workplace / "scenes" / TABLES[cell.table].placement / cell.scene
-
-
 def begun(path: Path, preset: Preset) -> dict[str, Any]:
     """What an earlier call has left, if it was of this preset and version.
 
@@ -77,6 +61,17 @@ def begun(path: Path, preset: Preset) -> dict[str, Any]:
     if version != VERSION or found != settings:
         raise InputError(f"{path}: is of another version or preset; name another --output-dir, or move it away")
     return result
+
+
+def write_result(path: Path, result: dict[str, Any]) -> None:
+    """result.json, every run on a line of its own.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    head = json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=1, allow_nan=False)
+    runs = ",\n".join(json.dumps(run, allow_nan=False) for run in result["runs"])
+    write_atomically(path, f'{head[:-2]},\n "runs": [\n{runs}\n ]\n}}\n'.encode())
 
 
 def run_cells(
@@ -99,21 +94,21 @@ def run_cells(
     result = begun(path, preset)
     make_folder(output_dir / "views", "--output-dir, folder")
     result["errors"] = []
-    progress = Progress(len(cells), "bench paper", start=len(cells) - len(_missing(cells, result)))
+    progress = Progress(len(cells), "bench paper", start=len(cells) - len(missing(cells, result)))
     for _ in range(BROKEN_POOLS):
-        missing = _missing(cells, result)
-        if not missing:
+        todo = missing(cells, result)
+        if not todo:
             break
         with new_executor() as executor:
             place = {
                 executor.submit(run_cell, cell, preset, data_of(cell), workplace / "runs", threads): cell
-                for cell in missing
+                for cell in todo
             }
             try:
                 for future in as_completed(place):
                     _take(result, place[future], future.exception(), future, output_dir / "views")
-                    write_json(path, result)
-                    progress.update(len(cells) - len(_missing(cells, result)))
+                    write_result(path, result)
+                    progress.update(len(cells) - len(missing(cells, result)))
             except BrokenExecutor:
                 continue
             except BaseException:
@@ -121,7 +116,7 @@ def run_cells(
                 raise
         break
     progress.close()
-    write_json(path, result)
+    write_result(path, result)
     return result
 
 
@@ -138,12 +133,15 @@ def _take(result: dict[str, Any], cell: Cell, problem: BaseException | None, fut
         result["errors"].append({**asdict(cell), "error": f"{type(problem).__name__}: {problem}"})
 
 
-def _missing(cells: list[Cell], result: dict[str, Any]) -> list[Cell]:
+def missing(cells: list[Cell], result: dict[str, Any]) -> list[Cell]:
+    """The cells that a result has neither trained nor told the failure of."""
     place = ("table", "scene", "strategy", "seed")
     done = {tuple(run[key] for key in place) for run in (*result["runs"], *result["errors"])}
     return [cell for cell in cells if (cell.table, cell.scene, cell.strategy, cell.seed) not in done]
 
 
-def cores() -> int:
-    """CPUs that this process may use."""
+def default_workers() -> int:
+    """As many as CPUs that this process may use; a GPU is one worker's."""
+    if torch.cuda.is_available():
+        return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
