@@ -49,6 +49,11 @@ class ImageBatch:
         """Where the images are."""
         return self.per_pixel["image"][0].device
 
+    @property
+    def channels(self) -> int:
+        """3 or 4, of every image."""
+        return self.per_pixel["image"][0].shape[-1]
+
     def image(self, k: int) -> np.ndarray:
         """Image at position k, (H, W, 3|4), as it is stored."""
         return self.per_pixel["image"][k].cpu().numpy()

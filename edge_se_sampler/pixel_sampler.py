@@ -20,9 +20,10 @@ from edge_se_sampler.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.edges import WHITE, edge_strength
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
+from edge_se_sampler.plain_background import PlainBackgrounds, of_the_object
 from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.ranking import keep_by_rank
-from edge_se_sampler.schedule import phase_at
+from edge_se_sampler.schedule import Watch, phase_at
 from edge_se_sampler.streams import Stream, stream
 
 SquaredError = Callable[[dict[str, Any]], Tensor]
@@ -59,6 +60,11 @@ class ImportantPixels:
         self._seed = 0
         self._step = 0
         self._rank, self._world = 0, 1
+        self.watch: Watch | None = None
+        """Decides the phase under schedule "auto"."""
+        self.trained_on: dict[str, Any] | None = None
+        """Under "auto" the last batch's pixels, until their errors are observed."""
+        self._backgrounds = PlainBackgrounds()
         self._tables: dict[str, _Tables] = {}
 
     def bind(
@@ -74,13 +80,26 @@ class ImportantPixels:
                 world-th row of one draw of world x N pixels (of candidates, of which each then keeps its own N).
         """
         self._squared_error = squared_error
+        self.watch = Watch() if self.config.schedule == "auto" else None
         self._early_steps = self.config.early_length(planned_steps)
         self._seed = seed
         self._rank, self._world = rank, world
 
     def set_step(self, step: int) -> None:
-        """The step about to be trained; the phase and the draws depend on it alone."""
+        """The step about to be trained; draws depend on it alone, and so does the phase but under "auto"."""
         self._step = step
+
+    def observe(self, squared_error: Tensor) -> None:
+        """What training found at the pixels of the last batch; under "auto" the phase follows from it.
+
+        Args:
+            squared_error: (n,) of the model's (fine) colours.
+        """
+        if self.watch is None or self.trained_on is None:
+            return
+        distance = self._backgrounds.squared_distance(self.trained_on, self.background)
+        self.watch.observe(*of_the_object(squared_error.detach(), distance.to(squared_error.device)))
+        self.trained_on = None
 
     @property
     def follows_training(self) -> bool:
@@ -92,7 +111,8 @@ class ImportantPixels:
         """How the current step draws: "uniform", "precrop", "edge" or "se"."""
         if not self.follows_training:
             return "uniform"
-        return self.config.early if phase_at(self._step, self._early_steps) == "early" else self.config.late
+        phase = phase_at(self._step, self._early_steps) if self.watch is None else self.watch.phase
+        return self.config.early if phase == "early" else self.config.late
 
     def strength(self, strategy: str, image: np.ndarray) -> np.ndarray:
         """Strength of every pixel under a strategy that weighs them; a seventh way overrides this.
@@ -143,8 +163,9 @@ class ImportantPixels:
         strategy, count = self.strategy, self.num_rays_per_batch
         if not self.follows_training:
             self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
-        for over in set(self._tables) - {strategy, "uniform"}:
-            del self._tables[over]  # the early phase is over: give its memory back
+        for over in set(self._tables) - {strategy, "uniform"} if self.watch is None else ():
+            del self._tables[over]  # the early phase is over for good: give its memory back
+        self.trained_on = None  # candidates are not
         if strategy == "se":
             pixels = self._candidates(batch, count)
         else:
@@ -152,6 +173,9 @@ class ImportantPixels:
             pixels = batch.gather(pixels)
             if weight is not None:
                 pixels["weight"] = weight
+        if self.watch is not None:
+            self._backgrounds.look_at(batch)
+            self.trained_on = {key: pixels[key] for key in ("indices", "image")}
         if self.config.keep_full_image:
             pixels["full_image"] = image_batch["image"]
         return pixels

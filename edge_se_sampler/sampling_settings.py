@@ -21,8 +21,9 @@ class SamplingSettings:
     """How pixels are drawn in the early phase: all alike, from the centred box, or in proportion to edge strength."""
     late: Literal["uniform", "se"] = "se"
     """How pixels are drawn afterwards: all alike, or by the rank of their squared error among uniform candidates."""
-    schedule: Literal["fraction", "steps"] = "fraction"
-    """What ends the early phase: a share of the planned iterations, or a number of steps."""
+    schedule: Literal["fraction", "steps", "auto"] = "fraction"
+    """What ends the early phase: a share of the planned iterations; a number of steps; or that training has learnt
+    the object (and it begins again if that is lost)."""
     early_fraction: float = 0.1
     """Share of the planned iterations that the early phase lasts (schedule: fraction); the paper's 1/10."""
     early_steps: int = 0
@@ -57,8 +58,8 @@ class SamplingSettings:
             refuse("early_fraction", "must be between 0 and 1")
         if self.schedule == "steps" and self.early_steps < 1:
             refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
-        if self.schedule == "fraction" and self.early_steps:
-            refuse("early_steps", "has no effect under schedule 'fraction'; add --...schedule steps")
+        if self.schedule != "steps" and self.early_steps:
+            refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
         if not 0 < self.edge_epsilon < float("inf"):
             refuse("edge_epsilon", "must be above 0 (0 would never train flat regions)")
         if self.se_candidates < 2:
@@ -69,7 +70,7 @@ class SamplingSettings:
             refuse("importance_weight", "has no effect when every pixel is drawn alike")
 
     def early_length(self, planned_steps: int) -> float:
-        """Steps that the early phase lasts in a run planned for that many."""
+        """Steps that the early phase lasts in a run planned for that many; under "auto" nobody knows."""
         # rounded: 0.07 * 100 is 7.000000000000001
         return self.early_steps if self.schedule == "steps" else round(self.early_fraction * planned_steps, 6)
 

@@ -26,6 +26,8 @@ class Stream(IntEnum):
     """Initial weights of the networks."""
     UNSEEN = 5
     """Poses and pixels of rays without an image."""
+    PROBE = 6
+    """Rays that a network is probed on."""
 
 
 def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Generator:

@@ -208,7 +208,7 @@ def test_the_gain_is_added_to_seen_and_unseen_rays_and_off_by_default() -> None:
             model.fine.density.bias.add_(1)
         model.begin_step(0, seed=1)
         model.random.manual_seed(1)  # the gain's turn has moved it on
-        return model.training_loss(tiny_rays(6), batch).detach(), model.unseen_loss(tiny_rays(6)).detach()
+        return model.training_loss(tiny_rays(6), batch)[0].detach(), model.unseen_loss(tiny_rays(6)).detach()
 
     (seen, unseen), (plain, nothing) = losses(3.0), losses(0.0)
     assert (seen - plain).min() > -1e-9
@@ -242,7 +242,9 @@ def test_a_step_minimises_the_error_and_the_entropy_of_as_many_unseen_rays() -> 
         setattr(model, name, lambda *a, method=method, kept=kept: (kept.append(method(*a)), kept[-1])[1])
     loss = trainer.train_iteration(0)
     assert asked == [trainer.config.pipeline.datamanager.train_num_rays_per_batch]
-    assert loss == pytest.approx(float((torch.cat(seen).mean() + torch.cat(entropy).mean()).detach()), rel=1e-5)
+    assert loss == pytest.approx(
+        float((torch.cat([loss for loss, _ in seen]).mean() + torch.cat(entropy).mean()).detach()), rel=1e-5
+    )
     assert torch.cat(entropy).mean() > 0
 
 

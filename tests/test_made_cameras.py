@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.data.made import SCENE_NAMES
-from edge_se_sampler.data.made.cameras import DISTANCE, Split, framing, poses
+from edge_se_sampler.data.made.cameras import DISTANCE, Placement, Split, framing, poses
 from edge_se_sampler.data.made.catalogue import made_scene
 from edge_se_sampler.data.made.render import render
 from edge_se_sampler.data.made.scene import Material, SceneBuilder

@@ -42,6 +42,7 @@ def test_purposes_never_change_their_number() -> None:
         "MODEL": 3,
         "WEIGHTS": 4,
         "UNSEEN": 5,
+        "PROBE": 6,
     }
 
 

@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edge_se_sampler.engine.evaluation import Picture, measures, render_rays
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.engine.evaluation import Picture, measures
 
 Outcome = Literal["learnt", "slow", "background"]
 
@@ -41,16 +40,3 @@ def outcome(psnr: float, background_psnr: float, share: float) -> Outcome:
     if share > 0.9:
         return "background"
     return "slow" if psnr < background_psnr + 0.5 else "learnt"
-
-
-def dead_networks(model: NeRFModel, pictures: list[Picture]) -> list[str]:
-    """Which of "coarse" and "fine" are dead on a quarter of the views' rays: no density at any sample, so no gradient.
-
-    The last interval is endless: the least density anywhere would make its ray opaque.
-    """
-    probes = [picture.rays(model.device)[slice(None, None, 4)] for picture in pictures]
-    return [
-        level
-        for level in ("coarse", "fine")
-        if not any(render_rays(model, rays, f"accumulation_{level}").any() for rays in probes)
-    ]

@@ -54,6 +54,19 @@ class VanillaDataManager:
         batch |= {key: value.to(self.device) for key, value in batch.items() if key != "full_image"}
         return self.train_ray_generator(batch["indices"]), batch
 
+    def observe(self, squared_error: Tensor) -> None:
+        """Tell the sampler the (N,) squared errors that training found on the last batch."""
+        if isinstance(self.train_pixel_sampler, ImportantPixels):
+            self.train_pixel_sampler.observe(squared_error)
+
+    def probe_rays(self, n: int, rng: np.random.Generator) -> RayBundle:
+        """n rays, uniform in the training images."""
+        cameras = self.train_ray_generator.cameras
+        numbers = rng.integers(len(cameras), size=n)
+        size = torch.cat((cameras.height, cameras.width), dim=1).cpu()[numbers]
+        pixels = torch.from_numpy(rng.random((n, 2)) * size.numpy()).long()
+        return self.train_ray_generator(torch.cat((torch.from_numpy(numbers)[:, None], pixels), dim=1))
+
     def unseen_rays(self, n: int, rng: np.random.Generator) -> RayBundle:
         """n rays, uniform in the image of a camera somewhere between two training cameras."""
         cameras = self.train_ray_generator.cameras

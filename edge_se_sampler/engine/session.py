@@ -132,8 +132,10 @@ def summary(config: TrainerConfig, run: RunFolder) -> str:
         f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
     ]
     if isinstance(sampler, SamplingSettings):
-        switch = math.ceil(sampler.early_length(config.max_num_iterations or 0))
-        lines.append(f"pixels   {sampler.early} for {switch} iterations, then {sampler.late}")
+        until = "until the object is learnt"
+        if sampler.schedule != "auto":
+            until = f"for {math.ceil(sampler.early_length(config.max_num_iterations or 0))} iterations"
+        lines.append(f"pixels   {sampler.early} {until}, then {sampler.late}")
     return "\n".join(lines)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.revival import PROBE_RAYS, Revival
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.tensorboard import EventWriter
 from edge_se_sampler.errors import InputError
@@ -45,6 +47,11 @@ class Trainer:
         self.callbacks = self.pipeline.datamanager.get_training_callbacks(
             TrainingCallbackAttributes(pipeline=self.pipeline, trainer=self)
         )
+        self.revival: Revival | None = None
+        if config.revive:
+            seed = config.machine.seed
+            probe = pipeline.datamanager.probe_rays(PROBE_RAYS, stream(seed, 0, Stream.PROBE))
+            self.revival = Revival(pipeline.model, self.optimizer, probe, seed)
         self._preview_psnr: float | None = None
 
     def resume(self) -> None:
@@ -56,6 +63,8 @@ class Trainer:
         state = load_checkpoint(latest_checkpoint(self.run.checkpoints), config_digest(self.config))
         self.pipeline.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
+        for part, watched in self._watched():
+            watched.load(state[part])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
         self.run.forget_after(state["step"])
 
@@ -101,9 +110,14 @@ class Trainer:
         rays, batch = self.pipeline.datamanager.next_train(step)
         self.optimizer.zero_grad(set_to_none=False)
         batch.pop("full_image", None)  # not of these rays alone
-        loss = self._backward(
-            len(rays), lambda rows: model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
-        )
+        errors = []
+
+        def seen_loss(rows: slice) -> torch.Tensor:
+            part, error = model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
+            errors.append(error)
+            return part
+
+        loss = self._backward(len(rays), seen_loss)
         if isinstance(model, InfoNeRFModel) and model.num_unseen_rays:
             rng = stream(seed, step, Stream.UNSEEN)
             unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, rng)
@@ -113,10 +127,21 @@ class Trainer:
         value = float(loss)
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
+        if self.revival is not None:
+            for level, sub_seed in self.revival.after_backward().items():
+                print(f"step {step}: the {level} network is dead and begins anew, sub-seed {sub_seed}", file=sys.stderr)
+                self._record(step, revived=level, sub_seed=sub_seed)
         self.optimizer.step()
+        self.pipeline.datamanager.observe(torch.cat(errors))
         for callback in self.callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return value
+
+    def _watched(self) -> list[tuple[str, Any]]:
+        """What has a state besides the weights, and its name in a checkpoint."""
+        watch = getattr(self.pipeline.datamanager.train_pixel_sampler, "watch", None)
+        parts = {"revival": self.revival, "watch": watch}
+        return [(name, part) for name, part in parts.items() if part is not None]
 
     def _backward(self, rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
         """Add the gradients of a loss's mean over rays, as many rays at a time as are worth rendering; that mean."""
@@ -149,7 +174,7 @@ class Trainer:
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-        }
+        } | {name: part.state() for name, part in self._watched()}
         save_checkpoint(self.run.checkpoints, self.next_step - 1, state)
 
     def _log(self, step: int, loss: float) -> None:

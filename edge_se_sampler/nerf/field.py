@@ -39,9 +39,13 @@ class NeRFField(nn.Module):
         self.feature = _linear(width, width)
         self.view = _linear(width + encoded_size(3, self.direction_frequencies), width // 2)
         self.color = _linear(width // 2, 3)
+        self.initialize(config.initialization, rng)
+
+    def initialize(self, how: str, rng: np.random.Generator) -> None:
+        """Give every layer initial weights, see `initialize`."""
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
-                initialize(layer, config.initialization, rng)
+                initialize(layer, how, rng)
 
     def forward(self, positions: Tensor, directions: Tensor, ray: Tensor | None, noise: Tensor | None = None):
         """Evaluate points.

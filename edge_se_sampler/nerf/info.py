@@ -87,10 +87,11 @@ class InfoNeRFModel(NeRFModel):
             angles = 2 * self._uniform(1, 3)[0].cpu() - 1
             self.rotation = turn(angles * math.radians(config.gain_degrees))
 
-    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> Tensor:
-        """(n,) NeRF's loss, and the information gain."""
+    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """(n,) NeRF's loss and the information gain; and the squared errors."""
         outputs = self(rays)
-        return self.loss(outputs, batch) + self._gain(rays, outputs)
+        loss = self.loss(outputs, batch) + self._gain(rays, outputs)
+        return loss, self.squared_error(outputs, batch["image"]).detach()
 
     def unseen_loss(self, rays: RayBundle) -> Tensor:
         """(n,) ray entropy and information gain."""

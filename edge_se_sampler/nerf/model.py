@@ -86,9 +86,10 @@ class NeRFModel(nn.Module):
         """
         return (outputs[f"rgb_{level}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
-    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> Tensor:
-        """(n,) what training minimises the mean of on a batch's rays."""
-        return self.loss(self(rays), batch)
+    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """(n,) what training minimises the mean of on a batch's rays, and (n,) the fine colours' squared errors."""
+        outputs = self(rays)
+        return self.loss(outputs, batch), self.squared_error(outputs, batch["image"]).detach()
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         """(n,) coarse + fine error of every ray, a mean over channels as in NeRF's code, times its weight if any."""

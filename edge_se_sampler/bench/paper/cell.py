@@ -13,11 +13,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.outcome import background_measures, dead_networks, foreground_share, outcome
+from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate, shade_behind
 from edge_se_sampler.engine.files import png_bytes
+from edge_se_sampler.engine.revival import dead_networks
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf.config import InfoNeRFModelConfig
@@ -44,6 +45,8 @@ class Table:
     """Settings of the model that differ from the paper's."""
     sampler: dict[str, Any] = field(default_factory=dict)
     """Settings of the sampler that differ."""
+    revive: bool = False
+    """Dead networks begin anew."""
 
 
 # A step of SE scores twice the rays without gradients: 5 units of work for 3, and with InfoNeRF's as many unseen rays
@@ -70,6 +73,17 @@ TABLES: dict[int, Table] = PAPERS | {
     14: Table("as 1, softplus density", strategies=("vanilla-nerf",), model={"density_activation": "softplus"}),
     15: Table("as 2, softplus density", "nerf", "shifted", ("vanilla-nerf",), model={"density_activation": "softplus"}),
     16: Table("as 2, but in the middle", "nerf", "padded", ("vanilla-nerf", "precrop-nerf", "edge-nerf")),
+    17: Table(
+        "as 7, dead networks begin anew", strategies=("vanilla-nerf",), model={"initialization": "torch"}, revive=True
+    ),
+    18: Table(
+        "as 8, dead networks begin anew",
+        "nerf",
+        "shifted",
+        ("vanilla-nerf",),
+        model={"initialization": "torch"},
+        revive=True,
+    ),
 }
 """The paper's four, and ours."""
 
@@ -157,6 +171,7 @@ def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> Train
         steps_per_save=iterations,
         steps_per_eval_image=iterations,
         steps_per_log=max(1, iterations // 50),
+        revive=table.revive,
         machine=MachineConfig(seed=cell.seed, device_type="auto"),
         pipeline=replace(config.pipeline, datamanager=manager, model=model),
     )
@@ -173,7 +188,7 @@ def run_cell(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads: 
     with contextlib.redirect_stderr(io.StringIO()):  # its progress: several cells write to one terminal
         trainer = prepare(config_of(cell, preset, data, output_dir))
         pictures, model = test_pictures(trainer.config), trainer.pipeline.model
-        dead = dead_networks(model, pictures)
+        dead = dead_networks(model, [picture.rays(model.device)[::4] for picture in pictures])
         began = time.process_time()
         trainer.train()
     cpu_seconds = time.process_time() - began

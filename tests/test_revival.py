@@ -1,0 +1,159 @@
+"""Dead networks: how they are told from living ones, and how they begin anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import tiny_config, tiny_rays, tiny_views
+
+from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.revival import LEVELS, PATIENCE, dead_networks
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.methods import STRATEGIES, registered_methods
+from edge_se_sampler.nerf.model import NeRFModel
+
+VIEWS = tiny_views(3, 12, 12)
+
+
+def trainer_of(folder: Path, method: str = "vanilla-nerf", *, revive: bool = True, seed: int = 0) -> Trainer:
+    config: TrainerConfig = registered_methods()[method].specification.config
+    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=16)
+    pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(width=16, depth=2))
+    machine = replace(config.machine, seed=seed)
+    config = replace(config, pipeline=pipeline, max_num_iterations=400, machine=machine, revive=revive)
+    config = planned(replace(config, output_dir=folder, experiment_name="e"), VIEWS)
+    return config.setup(run=RunFolder.create(config), pipeline=Pipeline.build(config, VIEWS, "cpu"), preview=None)
+
+
+def kill(model: NeRFModel, *levels: str) -> None:
+    with torch.no_grad():
+        for level in levels:
+            getattr(model, level).density.bias.fill_(-10)
+
+
+def weights(model: NeRFModel, level: str) -> torch.Tensor:
+    return torch.cat([weight.detach().flatten() for weight in getattr(model, level).parameters()])
+
+
+@pytest.mark.parametrize("dead", [(), ("coarse",), ("fine",), ("coarse", "fine")])
+def test_the_dead_are_told_from_the_living(dead: tuple[str, ...], tmp_path: Path) -> None:
+    model = trainer_of(tmp_path).pipeline.model
+    kill(model, *dead)
+    rays = RayBundle(**{k: v for k, v in vars(tiny_rays(30, dtype=torch.float32)).items()})
+    assert dead_networks(model, [rays[:10], rays[10:]]) == list(dead)
+
+
+@pytest.mark.parametrize("method", STRATEGIES)
+def test_networks_dead_at_the_start_begin_anew_under_every_strategy(method: str, tmp_path: Path, capsys: Any) -> None:
+    trainer = trainer_of(tmp_path, method)
+    kill(trainer.pipeline.model, "coarse", "fine")
+    for step in range(PATIENCE + 20):
+        trainer.train_iteration(step)
+    assert trainer.revival is not None
+    assert trainer.revival.used >= 2
+    assert dead_networks(trainer.pipeline.model, [trainer.revival.probe]) == []
+    assert "the coarse network is dead and begins anew, sub-seed 1" in capsys.readouterr().err
+    revived = [line for line in trainer.run.metrics() if "revived" in line]
+    assert [(line["step"], line["revived"], line["sub_seed"]) for line in revived[:2]] == [
+        (PATIENCE - 1, "coarse", 1),
+        (PATIENCE - 1, "fine", 2),
+    ]
+
+
+@pytest.mark.parametrize("dead", LEVELS)
+def test_only_the_dead_one_begins_anew(dead: str, tmp_path: Path) -> None:
+    trainer = trainer_of(tmp_path)
+    model, (other,) = trainer.pipeline.model, [level for level in LEVELS if level != dead]
+    kill(model, dead)
+    for step in range(PATIENCE - 1):
+        trainer.train_iteration(step)
+    before = {level: weights(model, level) for level in LEVELS}
+    trainer.train_iteration(PATIENCE - 1)
+    moved = {level: float((weights(model, level) - before[level]).abs().max()) for level in LEVELS}
+    assert moved[dead] > 0.3  # new weights
+    assert 0 < moved[other] < 0.05  # a step of training
+    assert trainer.revival is not None
+    assert trainer.revival.used == 1
+
+
+def test_without_it_the_dead_stay_dead(tmp_path: Path) -> None:
+    """The negative control, and what the faithful methods do."""
+    trainer = trainer_of(tmp_path, "edge-se-nerf", revive=False)
+    kill(trainer.pipeline.model, "coarse", "fine")
+    before = weights(trainer.pipeline.model, "fine")
+    for step in range(3 * PATIENCE):
+        trainer.train_iteration(step)
+    assert trainer.revival is None
+    torch.testing.assert_close(weights(trainer.pipeline.model, "fine"), before, rtol=0, atol=0)
+
+
+def test_the_living_are_left_alone(tmp_path: Path) -> None:
+    """Empty batches have no density gradient either; the probe tells."""
+    trainer, plain = trainer_of(tmp_path), trainer_of(tmp_path, revive=False)
+    for step in range(2 * PATIENCE):
+        assert trainer.train_iteration(step) == plain.train_iteration(step)
+    revival = trainer.revival
+    assert revival is not None
+    for _ in range(3 * PATIENCE):
+        trainer.optimizer.zero_grad(set_to_none=False)
+        assert revival.after_backward() == {}
+    assert revival.used == 0
+
+
+def test_a_revived_run_is_a_function_of_its_seed(tmp_path: Path) -> None:
+    def trained(seed: int) -> list[float]:
+        trainer = trainer_of(tmp_path, seed=seed)
+        kill(trainer.pipeline.model, "coarse", "fine")
+        return [trainer.train_iteration(step) for step in range(PATIENCE + 10)]
+
+    assert trained(0) == trained(0)
+    assert trained(0) != trained(1)
+
+
+def test_new_weights_are_the_next_sub_seeds(tmp_path: Path) -> None:
+    trainer = trainer_of(tmp_path)
+    model, found = trainer.pipeline.model, []
+    for start in (0, PATIENCE):
+        kill(model, "fine")
+        for step in range(start, start + PATIENCE):
+            trainer.train_iteration(step)
+        found.append(weights(model, "fine"))
+    assert trainer.revival is not None
+    assert trainer.revival.used == 2
+    assert float((found[0] - found[1]).abs().max()) > 0.3
+
+
+@pytest.mark.parametrize("saved_after", [PATIENCE - 3, PATIENCE + 2])
+def test_a_checkpoint_remembers_silence_and_sub_seeds(saved_after: int, tmp_path: Path) -> None:
+    trainer = trainer_of(tmp_path)
+    kill(trainer.pipeline.model, "coarse", "fine")
+    for step in range(saved_after):
+        trainer.train_iteration(step)
+        trainer.next_step = step + 1
+    trainer.save()
+    went_on = [trainer.train_iteration(step) for step in range(saved_after, saved_after + 12)]
+
+    resumed = trainer.config.setup(run=trainer.run, pipeline=Pipeline.build(trainer.config, VIEWS, "cpu"), preview=None)
+    resumed.resume()
+    assert resumed.next_step == saved_after
+    assert [resumed.train_iteration(step) for step in range(saved_after, saved_after + 12)] == went_on
+    assert resumed.revival.used == trainer.revival.used >= 2  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_the_probe_sees_every_image(tmp_path: Path) -> None:
+    trainer = trainer_of(tmp_path)
+    assert trainer.revival is not None
+    numbers = trainer.revival.probe.camera_indices[:, 0]
+    assert np.unique(numbers.numpy()).tolist() == [0, 1, 2]
+    again = trainer_of(tmp_path).revival
+    assert again is not None
+    torch.testing.assert_close(again.probe.origins, trainer.revival.probe.origins)

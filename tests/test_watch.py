@@ -1,0 +1,179 @@
+"""The watch over the errors, which ends the early phase when the object is learnt and begins it again when lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from batches import batch_of, following
+
+from edge_se_sampler.image_batch import ImageBatch
+from edge_se_sampler.plain_background import PlainBackgrounds, of_the_object
+from edge_se_sampler.schedule import LEARNT, LOST, WINDOW_STEPS, Watch
+
+
+def phases(remaining: Any, count: int = 64, noise: float = 0.0, watch: Watch | None = None) -> list[str]:
+    """The phase after each step of a trace of R, the object's error as a share of an empty scene's."""
+    watch, rng = watch or Watch(), np.random.default_rng(0)
+    told = []
+    for share in remaining:
+        background = float(rng.uniform(0.2, 0.8)) if noise else 0.5  # images differ
+        watch.observe(count, share * background * float(np.exp(noise * rng.normal())), background)
+        told.append(watch.phase)
+    return told
+
+
+LEARNING = np.concatenate((np.linspace(1, 0.2, 100), np.full(200, 0.2)))
+
+
+def test_learnt_ends_the_early_phase_once() -> None:
+    told = phases(LEARNING)
+    first = told.index("late")
+    crossed = int(np.argmax(LEARNING < LEARNT))
+    assert crossed <= first <= crossed + 2 * WINDOW_STEPS
+    assert set(told[first:]) == {"late"}
+
+
+@pytest.mark.parametrize("remaining", [1.0, 0.9, 0.7])
+def test_never_learnt_stays_early(remaining: float) -> None:
+    assert set(phases(np.full(2000, remaining), noise=0.3)) == {"early"}
+
+
+def test_lost_again_begins_it_anew() -> None:
+    told = phases(np.concatenate((np.full(100, 0.2), np.full(100, 1.0), np.full(100, 0.2))))
+    changes = [i for i in range(1, 300) if told[i] != told[i - 1]]
+    assert [told[i] for i in changes] == ["late", "early", "late"]
+    assert changes[0] < 40
+    assert 100 < changes[1] < 160
+    assert 200 < changes[2] < 260
+
+
+def test_noise_does_not_throw_it_about() -> None:
+    """A learnt object seen by one or two pixels a step, each error off by a factor of two: no false alarm."""
+    told = phases(np.full(20_000, 0.3), count=2, noise=0.7)
+    assert set(told[200:]) == {"late"}
+
+
+def test_between_the_bounds_a_phase_stays_what_it_was() -> None:
+    middle = np.full(500, (LEARNT + LOST) / 2)
+    assert set(phases(middle)) == {"early"}
+    watch = Watch()
+    phases(np.full(100, 0.2), watch=watch)
+    assert set(phases(middle, watch=watch)) == {"late"}
+
+
+def test_steps_without_the_object_tell_nothing() -> None:
+    watch = Watch()
+    for _ in range(1000):
+        watch.observe(0, 0.0, 0.0)
+    assert watch.phase == "early"
+    assert watch.remaining == 1
+    phases(np.full(100, 0.2), watch=watch)
+    before = watch.state()
+    watch.observe(0, 0.0, 0.0)
+    assert watch.state() == before | {"observations": before["observations"] + 1}
+
+
+def test_it_goes_on_from_a_state() -> None:
+    trace = np.concatenate((np.linspace(1, 0.2, 40), np.full(60, 1.0), np.full(60, 0.3)))
+    whole = phases(trace)
+    for cut in range(0, 160, 7):  # in the middle of every phase
+        first, second = Watch(), Watch()
+        begun = phases(trace[:cut], watch=first)
+        second.load(first.state())
+        assert begun + phases(trace[cut:], watch=second) == whole, cut
+
+
+# -- what an empty scene would show
+
+
+def test_distance_from_the_background_with_alpha() -> None:
+    image = torch.tensor([[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.5], [0.3, 0.4, 0.5, 0.0]])
+    pixels = {"indices": torch.zeros((3, 3), dtype=torch.int64), "image": image}
+    found = PlainBackgrounds().squared_distance(pixels, (1.0, 1.0, 1.0))
+    torch.testing.assert_close(found, torch.tensor([2.0, 0.5, 0.0]))
+    found = PlainBackgrounds().squared_distance(pixels, (0.0, 0.0, 0.0))
+    torch.testing.assert_close(found, torch.tensor([1.0, 0.25, 0.0]))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_without_alpha_the_border_tells_the_background(dtype: torch.dtype) -> None:
+    batch = batch_of(dtype=dtype)
+    full = 255 if dtype == torch.uint8 else 1
+    colors = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    for image, color in zip(batch["image"], colors, strict=True):
+        image[:] = (color * full).to(dtype)
+        image[2:5, 2:5] = 0  # the object
+    backgrounds = PlainBackgrounds()
+    backgrounds.look_at(ImageBatch.of(batch, use_mask=False))
+    backgrounds.look_at(ImageBatch.of(batch, use_mask=False))
+    numbers = batch["image_idx"]
+    for row, expected in ((0, 0.0), (3, 1.0)):
+        indices = torch.stack((numbers, torch.full((3,), row), torch.full((3,), 3)), dim=1)
+        pixels = {"indices": indices, "image": torch.stack([image[row, 3] for image in batch["image"]])}
+        distance = backgrounds.squared_distance(pixels, (1.0, 1.0, 1.0))
+        torch.testing.assert_close(distance, expected * colors.square().sum(dim=1))
+
+
+def test_only_the_object_counts() -> None:
+    error, distance = torch.tensor([0.5, 9.0, 0.1, 7.0]), torch.tensor([1.0, 0.0, 0.5, 0.009])
+    count, mean_error, mean_distance = of_the_object(error, distance)
+    assert (count, mean_error, mean_distance) == (2, pytest.approx(0.3), pytest.approx(0.75))
+    assert of_the_object(error[1:2], distance[1:2]) == (0, 0.0, 0.0)
+
+
+# -- the sampler under it
+
+
+def auto(**settings: Any) -> Any:
+    return following(schedule="auto", rays=64, **settings)
+
+
+def trained(sampler: Any, share: float, steps: int = 40) -> list[str]:
+    """Strategies of steps whose errors are this share of an empty scene's."""
+    told = []
+    host = batch_of(channels=4)
+    for step in range(steps):
+        sampler.set_step(step)
+        told.append(sampler.strategy)
+        image = sampler.sample(host)["image"].float() / 255
+        sampler.observe(share * (image[:, 3:] * (image[:, :3] - 1)).square().sum(dim=1))
+    return told
+
+
+def test_the_sampler_follows_the_watch() -> None:
+    sampler = auto()
+    assert set(trained(sampler, 1.0)) == {"edge"}
+    told = trained(sampler, 0.2)
+    assert told[0] == "edge"
+    assert told[-1] == "se"
+    assert trained(sampler, 1.0)[-1] == "edge"  # lost: its tables are still there, or made again
+
+
+def test_candidates_are_not_what_was_trained_on() -> None:
+    """Scoring happens before there is a batch: what is then observed is nobody's."""
+    sampler = auto()
+    trained(sampler, 0.2)
+    assert sampler.strategy == "se"
+    before = sampler.watch.state()
+    sampler._squared_error = lambda candidates: (
+        sampler.observe(torch.ones(len(candidates["indices"]))),
+        candidates["image"].float().mean(dim=1),
+    )[1]
+    sampler.sample(batch_of(channels=4))
+    assert sampler.watch.state() == before
+    sampler.observe(torch.zeros(64))
+    after = sampler.watch.state()
+    sampler.observe(torch.zeros(64))  # and once only
+    assert sampler.watch.state() == after != before
+
+
+def test_other_schedules_watch_nothing() -> None:
+    sampler = following(step=500)
+    sampler.sample(batch_of(channels=4))
+    sampler.observe(torch.ones(64))
+    assert sampler.watch is None
+    assert sampler.trained_on is None
+    assert sampler.strategy == "se"
