@@ -15,8 +15,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from edge_se_sampler.datamanager import scoring
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
-from edge_se_sampler.nerfstudio.planned import planned_steps
-from edge_se_sampler.nerfstudio.scoring import ray_errors, shade_behind
+from edge_se_sampler.nerfstudio.planned import planned_steps, remember_watch
+from edge_se_sampler.nerfstudio.scoring import ray_errors, shade_behind, watch_training
 from edge_se_sampler.sampling_settings import SamplingSettings
 
 
@@ -40,7 +40,7 @@ class EdgeSEDataManager(VanillaDataManager):
         """nerfstudio's callbacks and ours; called once the checkpoint, if there is one, has been loaded."""
         callbacks = super().get_training_callbacks(training_callback_attributes)
         if isinstance(self.train_pixel_sampler, EdgeSEPixelSampler):
-            callbacks.append(_follow(self, training_callback_attributes.trainer))
+            callbacks += _follow(self, training_callback_attributes.trainer)
         return callbacks
 
 
@@ -75,11 +75,11 @@ def attach(trainer: Any, **settings: Any) -> None:
         raise InputError(f"the training sampler is a {type(sampler).__name__}: important pixels would not do its work")
     config = EdgeSEPixelSamplerConfig(**(_known(sampler.config) | settings))
     manager.train_pixel_sampler = config.setup(num_rays_per_batch=sampler.num_rays_per_batch)
-    trainer.callbacks.append(_follow(manager, trainer))
+    trainer.callbacks += _follow(manager, trainer)
 
 
-def _follow(manager: Any, trainer: Any) -> TrainingCallback:
-    """Bind a data manager's training sampler to the run; the callback tells it the step."""
+def _follow(manager: Any, trainer: Any) -> list[TrainingCallback]:
+    """Bind a data manager's training sampler to the run; the callbacks tell it the step, and keep what it watches."""
     sampler, config = manager.train_pixel_sampler, trainer.config
     sampler.background = shade_behind(trainer.pipeline.model)
     sampler.bind(
@@ -89,10 +89,15 @@ def _follow(manager: Any, trainer: Any) -> TrainingCallback:
         rank=config.machine.machine_rank * config.machine.num_devices + trainer.local_rank,
         world=trainer.world_size,
     )
+    callbacks = [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
+    if sampler.watch is not None:
+        watch_training(trainer.pipeline.model, sampler)
+        keep = remember_watch(trainer, sampler.watch)
+        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], keep))
     loader = manager.train_image_dataloader
     if loader.cache_all_images:
         sampler.check_images(loader.cached_collated_batch)
-    return TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)
+    return callbacks
 
 
 def _plain(shared: PixelSamplerConfig) -> PixelSamplerConfig:

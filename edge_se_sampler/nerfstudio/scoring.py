@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,8 +14,14 @@ from torch import Tensor, nn
 
 from edge_se_sampler.edges import WHITE
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.pixel_sampler import ImportantPixels
+from edge_se_sampler.schedule import Watch
 
 BLACK = (0.0, 0.0, 0.0)
+HOPELESS_AFTER = 1000
+"""Iterations."""
+HOPELESS = 0.98
+"""Share of an empty scene's error."""
 
 
 def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
@@ -24,21 +31,61 @@ def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
         InputError: the model renders neither "rgb" nor "rgb_fine".
     """
     with _without_trace(model):
-        outputs = model(ray_bundle)
-        level = next((level for level in ("", "_fine") if f"rgb{level}" in outputs), None)
-        if level is None:
-            raise InputError(f"{type(model).__name__} renders neither rgb nor rgb_fine: late 'se' cannot score it")
-        colors = outputs[f"rgb{level}"]
-        image = batch["image"].to(colors.device)
-        if image.dtype == torch.uint8:
-            image = image.float() / 255
-        accumulation = outputs.get(f"accumulation{level}")
-        renderer: Any = getattr(model, "renderer_rgb", None)
-        if accumulation is not None and hasattr(renderer, "blend_background_for_loss_computation"):
-            colors, image = renderer.blend_background_for_loss_computation(
-                pred_image=colors, pred_accumulation=accumulation, gt_image=image
-            )
-        return (colors.float() - image[:, :3]).square().sum(dim=1)
+        return squared_errors(model, model(ray_bundle), batch["image"])
+
+
+def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Tensor:
+    """(n,) squared errors of rendered rays.
+
+    Args:
+        image: (n, 3|4) pixels, uint8 or in [0, 1].
+
+    Raises:
+        InputError: the outputs have neither "rgb" nor "rgb_fine".
+    """
+    level = next((level for level in ("", "_fine") if f"rgb{level}" in outputs), None)
+    if level is None:
+        raise InputError(f"{type(model).__name__} renders neither rgb nor rgb_fine: its errors cannot be told")
+    colors = outputs[f"rgb{level}"]
+    image = image.to(colors.device)
+    if image.dtype == torch.uint8:
+        image = image.float() / 255
+    accumulation = outputs.get(f"accumulation{level}")
+    renderer: Any = getattr(model, "renderer_rgb", None)
+    if accumulation is not None and hasattr(renderer, "blend_background_for_loss_computation"):
+        colors, image = renderer.blend_background_for_loss_computation(
+            pred_image=colors, pred_accumulation=accumulation, gt_image=image
+        )
+    return (colors.float() - image[:, :3]).square().sum(dim=1)
+
+
+def watch_training(model: nn.Module, sampler: ImportantPixels) -> None:
+    """Tell the sampler the errors of every training batch that the model renders (schedule "auto").
+
+    Evaluation is not in training mode, and while candidates are scored the sampler waits for no batch.
+    """
+
+    def observe(module: nn.Module, _: Any, outputs: dict[str, Tensor]) -> None:
+        batch = sampler.trained_on
+        if not module.training or batch is None:
+            return
+        with torch.no_grad():
+            errors = squared_errors(module, outputs, batch["image"])
+        if len(errors) == len(batch["indices"]):
+            sampler.observe(errors)
+            _warn_of_the_dead(sampler.watch)
+
+    model.register_forward_hook(observe)
+
+
+def _warn_of_the_dead(watch: Watch | None) -> None:
+    """Once, in the log: what a sampler cannot help."""
+    if watch is not None and watch.observations == HOPELESS_AFTER and watch.remaining > HOPELESS:
+        print(
+            f"edge-se-sampler: after {HOPELESS_AFTER} iterations nothing of the object is learnt. Its density may be "
+            "dead (negative everywhere, no gradient), which no choice of pixels can help: try another --machine.seed",
+            file=sys.stderr,
+        )
 
 
 @contextmanager

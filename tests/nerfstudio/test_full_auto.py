@@ -1,0 +1,106 @@
+"""The whole host under schedule "auto": the phases follow the errors that training sees, and nothing else."""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytestmark = pytest.mark.nerfstudio_full
+pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio 1.1.5")
+
+from full_host import PLANNED, config_of, train, trainer_of, watch  # noqa: E402
+
+from edge_se_sampler.nerfstudio.planned import WATCH_FILE  # noqa: E402
+from edge_se_sampler.nerfstudio.scoring import HOPELESS_AFTER, squared_errors  # noqa: E402
+from edge_se_sampler.schedule import WINDOW_STEPS  # noqa: E402
+
+
+def auto(name: str, scene: Path, runs: Path, **changes: Any) -> Any:
+    config = config_of(name, scene, runs, **changes)
+    config.pipeline.datamanager.pixel_sampler.schedule = "auto"
+    return config
+
+
+def observed(trainer: Any) -> list[float]:
+    """The mean error of every observation from now on."""
+    sampler, told = trainer.pipeline.datamanager.train_pixel_sampler, []
+    observe = sampler.observe
+    sampler.observe = lambda errors: (told.append(float(errors.mean())), observe(errors))[1]
+    return told
+
+
+@pytest.mark.parametrize("alpha", ["white", None])
+@pytest.mark.parametrize("name", ["edge-se-nerf", "edge-se-nerfacto"])
+def test_every_training_batch_is_observed_once(name: str, alpha: str | None, host_scene: Path, tmp_path: Path) -> None:
+    trainer = trainer_of(auto(name, host_scene, tmp_path, alpha=alpha))
+    sampler = trainer.pipeline.datamanager.train_pixel_sampler
+    told = observed(trainer)
+    rendered: list[float] = []
+
+    def record(module: Any, _: Any, outputs: Any) -> None:
+        if module.training and sampler.trained_on is not None:
+            rendered.append(float(squared_errors(module, outputs, sampler.trained_on["image"]).detach().mean()))
+
+    hooks = trainer.pipeline.model._forward_hooks
+    handle = trainer.pipeline.model.register_forward_hook(record)
+    hooks.move_to_end(handle.id, last=False)  # before ours, which takes the batch
+    train(trainer, 3)
+    trainer.pipeline.eval()
+    trainer.pipeline.get_eval_loss_dict(0)
+    trainer.pipeline.train()
+    assert len(told) == 3
+    assert told == rendered
+    sampler.watch.phase = "late"
+    trainer._start_step = 3
+    train(trainer, 2)  # with candidates scored before each
+    assert len(told) == 5
+
+
+def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
+    trainer = trainer_of(auto("edge-se-nerf", host_scene, tmp_path))
+    sampler = trainer.pipeline.datamanager.train_pixel_sampler
+    observe, share = sampler.observe, 1.0
+
+    def as_if(errors: torch.Tensor) -> None:
+        distance = sampler._backgrounds.squared_distance(sampler.trained_on, sampler.background)
+        observe(share * distance)
+
+    sampler.observe = as_if
+    seen = watch(sampler)
+    train(trainer, 30)
+    assert {strategy for _, strategy, _ in seen} == {"edge"}  # though planned for 20 steps
+    share = 0.1
+    trainer._start_step = 30
+    train(trainer, WINDOW_STEPS + 3)
+    assert seen[-1][1] == "se"
+
+
+def test_a_resumed_run_goes_on_watching(host_scene: Path, tmp_path: Path) -> None:
+    config = auto("edge-se-nerf", host_scene, tmp_path, max_num_iterations=PLANNED)
+    trainer = trainer_of(config)
+    trainer.train()
+    saved = trainer.checkpoint_dir.parent / WATCH_FILE
+    states = json.loads(saved.read_text())
+    assert states[str(PLANNED - 1)]["observations"] == PLANNED
+    assert all("step" in path.name for path in trainer.checkpoint_dir.iterdir())  # nothing of ours among them
+    again = copy.deepcopy(config)
+    again.load_dir, again.timestamp = trainer.checkpoint_dir, "resumed"
+    resumed = trainer_of(again)
+    assert resumed.pipeline.datamanager.train_pixel_sampler.watch.state() == states[str(PLANNED - 1)]
+
+
+def test_what_no_sampler_can_help_is_told_once(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
+    trainer = trainer_of(auto("edge-se-nerf", host_scene, tmp_path))
+    field = trainer.pipeline.model.field_fine.field_output_density.net
+    with torch.no_grad():  # its softplus is never dead, but may be as good as that
+        field.weight.zero_()
+        field.bias.fill_(-40)
+    trainer.pipeline.datamanager.train_pixel_sampler.watch.observations = HOPELESS_AFTER - 2
+    train(trainer, 5)
+    assert capfd.readouterr().err.count("nothing of the object is learnt") == 1
