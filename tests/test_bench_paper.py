@@ -15,10 +15,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from edge_se_sampler.bench import experiment as running
 from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.bench.paper import estimate
-from edge_se_sampler.bench.paper import run as running
 from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, TABLES, Cell, Preset, cells, config_of, run_cell
+from edge_se_sampler.bench.paper.outputs import keep_view
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES, published
 from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
 from edge_se_sampler.data.blender import read_blender
@@ -116,11 +117,16 @@ def test_outcomes(psnr: float, share: float, expected: str) -> None:
 def experiment(tmp_path: Path) -> Callable[..., dict[str, Any]]:
     """Run cells of the small preset, in threads of this process."""
 
-    def run(todo: list[Cell], **changes: Any) -> dict[str, Any]:
-        data_of = made_scenes(SMALL, todo, tmp_path / "w")
-        (tmp_path / "out").mkdir(exist_ok=True)
-        executor = changes.pop("executor", lambda: ThreadPoolExecutor(1))
-        return running.run_cells(todo, SMALL, data_of, tmp_path / "out", tmp_path / "w", executor, threads=1)
+    def run(todo: list[Cell], train: Any = run_cell, executor: Any = lambda: ThreadPoolExecutor(1)) -> dict[str, Any]:
+        data_of, out = made_scenes(SMALL, todo, tmp_path / "w"), tmp_path / "out"
+        (out / "views").mkdir(parents=True, exist_ok=True)
+        result = running.begun(out / "result.json", SMALL)
+        running.run_cells(
+            todo, result, out / "result.json", executor, train,
+            lambda cell: (SMALL, data_of(cell), tmp_path / "w" / "runs", 1),
+            lambda cell, run: keep_view(out, cell, run),
+        )  # fmt: skip
+        return result
 
     return run
 
@@ -128,7 +134,7 @@ def experiment(tmp_path: Path) -> Callable[..., dict[str, Any]]:
 TWO_CELLS = [Cell(1, "mic", "vanilla-nerf", 0), Cell(4, "mic", "edge-se-nerf", 1)]
 
 
-def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path) -> None:
     first = experiment(TWO_CELLS[:1])
     assert [(run["table"], run["method"], run["placement"], run["steps"]) for run in first["runs"]] == [
         (1, "nerf", "centered", 4)
@@ -140,8 +146,7 @@ def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path, mo
         trained.append(cell)
         return real(cell, *arguments)
 
-    monkeypatch.setattr(running, "run_cell", counted)
-    result = experiment(TWO_CELLS)
+    result = experiment(TWO_CELLS, counted)
     assert trained == TWO_CELLS[1:]
     assert json.loads((tmp_path / "out" / "result.json").read_text()) == json.loads(json.dumps(result))
     last = result["runs"][1]
@@ -163,9 +168,7 @@ def test_a_cell_gives_the_same_result_alone_and_in_another_process(tmp_path: Pat
         assert own[key] == other[key], key
 
 
-def test_a_failing_cell_is_told_and_stops_no_other(
-    experiment: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_cell_is_told_and_stops_no_other(experiment: Any) -> None:
     real = run_cell
 
     def failing(cell: Cell, *arguments: Any) -> dict[str, Any]:
@@ -173,13 +176,11 @@ def test_a_failing_cell_is_told_and_stops_no_other(
             raise FloatingPointError("the loss is not finite at step 3")
         return real(cell, *arguments)
 
-    monkeypatch.setattr(running, "run_cell", failing)
-    result = experiment(TWO_CELLS)
+    result = experiment(TWO_CELLS, failing)
     assert [run["table"] for run in result["runs"]] == [4]
     assert [(e["table"], e["error"]) for e in result["errors"]] == [
         (1, "FloatingPointError: the loss is not finite at step 3")
     ]
-    monkeypatch.setattr(running, "run_cell", real)
     assert len(experiment(TWO_CELLS)["runs"]) == 2  # the next call tries it again
 
 
@@ -192,14 +193,13 @@ def dies_once(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads:
     return {**vars(cell), "psnr": 30.0, "outcome": "learnt", "view": b""}
 
 
-def test_a_killed_worker_costs_no_finished_cell(experiment: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running, "run_cell", dies_once)
-    result = experiment(TWO_CELLS, executor=running.executor_of(1, None))
+def test_a_killed_worker_costs_no_finished_cell(experiment: Any) -> None:
+    result = experiment(TWO_CELLS, dies_once, running.executor_of(1, None))
     assert len(result["runs"]) == 2
     assert result["errors"] == []
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[]", '{"version": 0, "preset": {}}'])
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"version": 0, "settings": {}, "runs": []}'])
 def test_another_result_is_neither_continued_nor_overwritten(content: str, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     path.write_text(content)
@@ -212,7 +212,7 @@ def test_a_result_of_another_preset_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     path.write_text(json.dumps(running.begun(path, SMALL)))
     assert running.begun(path, SMALL)["runs"] == []
-    with pytest.raises(InputError, match="another version or preset"):
+    with pytest.raises(InputError, match="another version or size"):
         running.begun(path, replace(SMALL, rays=17))
 
 

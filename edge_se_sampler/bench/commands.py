@@ -128,11 +128,11 @@ class BenchPaper:
     """Only tell which cells there are and how long they will take; trains nothing, writes nothing."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells
+        from edge_se_sampler.bench.experiment import begun, default_workers, executor_of, missing, run_cells
+        from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells, run_cell
         from edge_se_sampler.bench.paper.estimate import plan_of
-        from edge_se_sampler.bench.paper.outputs import write_outputs
+        from edge_se_sampler.bench.paper.outputs import keep_view, write_outputs
         from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
-        from edge_se_sampler.bench.paper.run import begun, default_workers, executor_of, missing, run_cells
         from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
@@ -154,18 +154,23 @@ class BenchPaper:
         workers = self.workers or default_workers()
         if self.data is not None:
             check_real(self.data, todo)
-        before = begun(self.output_dir / "result.json", preset)
+        path = self.output_dir / "result.json"
+        result = begun(path, preset)
         if self.dry_run:
-            print(plan_of(todo, len(todo) - len(missing(todo, before)), preset, workers))
+            print(plan_of(todo, len(todo) - len(missing(todo, result)), preset, workers))
             return
         require_pyplot()
         new_executor = executor_of(workers, self.scheduler)
-        make_folder(self.output_dir, "--output-dir")
+        make_folder(self.output_dir / "views", "--output-dir")
         if self.data is None:
             data_of = made_scenes(preset, todo, self.workplace)
         else:
             data_of = real_scenes(self.data, todo, self.workplace)
-        result = run_cells(todo, preset, data_of, self.output_dir, self.workplace, new_executor, threads=1)
+        run_cells(
+            todo, result, path, new_executor, run_cell,
+            lambda cell: (preset, data_of(cell), self.workplace / "runs", 1),
+            lambda cell, run: keep_view(self.output_dir, cell, run),
+        )  # fmt: skip
         write_outputs(result, data_of, self.output_dir)
         for error in result["errors"]:
             print(f"table {error['table']}, {error['scene']}, {error['strategy']}, {error['seed']}: {error['error']}")

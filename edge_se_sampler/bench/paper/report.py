@@ -41,7 +41,7 @@ def report(result: dict[str, Any], figures: list[Path]) -> str:
     """The page.
 
     Args:
-        result: with `runs`, `verdicts`, `preset` and `machine`.
+        result: with `runs`, `verdicts`, `settings` and `machine`.
         figures: PNG files, which it carries inside.
     """
     runs = result["runs"]
@@ -168,5 +168,5 @@ def _dead_starts(runs: list[dict[str, Any]]) -> list[str]:
 
 
 def _settings(result: dict[str, Any]) -> str:
-    told = [f"{key} {value}" for part in (result["preset"], result["machine"]) for key, value in part.items()]
+    told = [f"{key} {value}" for part in (result["settings"], result["machine"]) for key, value in part.items()]
     return ", ".join(told)
