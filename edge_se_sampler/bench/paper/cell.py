@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import time
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import torch
-
-from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
+from edge_se_sampler.bench.trial import trial
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
-from edge_se_sampler.engine.evaluation import evaluate, shade_behind
-from edge_se_sampler.engine.files import png_bytes
-from edge_se_sampler.engine.revival import dead_networks
-from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf.config import InfoNeRFModelConfig
 
@@ -114,9 +104,6 @@ PRESETS = {
 }
 
 
-MEASURES = ("psnr", "ssim", "foreground_psnr", "edge_band_psnr", "background_mse")
-
-
 @dataclass(frozen=True)
 class Cell:
     """Where a cell stands."""
@@ -181,42 +168,8 @@ def run_cell(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads: 
     """Train a cell and measure it; runs in a process of its own.
 
     Returns:
-        its place, psnr and the other measures, outcome, which networks were dead before the first step, seconds, CPU
-        seconds, steps, the curve of the training loss, and `view`, a held-out view as PNG.
+        its place, and what `trial` measures.
     """
-    torch.set_num_threads(threads)
-    with contextlib.redirect_stderr(io.StringIO()):  # its progress: several cells write to one terminal
-        trainer = prepare(config_of(cell, preset, data, output_dir))
-        pictures, model = test_pictures(trainer.config), trainer.pipeline.model
-        dead = dead_networks(model, [picture.rays(model.device)[::4] for picture in pictures])
-        began = time.process_time()
-        trainer.train()
-    cpu_seconds = time.process_time() - began
-    if trainer.stop_requested:
-        raise KeyboardInterrupt
-    views: list[np.ndarray] = []
-    results = evaluate(model, pictures, lambda _, __, rendered: views.append(rendered))
-    background = background_measures(pictures, shade_behind(model))
-    background_psnr = sum(alone["psnr"] or 0.0 for alone in background) / len(background)
-    share = foreground_share(results, background)
-    every, logged = trainer.config.steps_per_log, [line for line in trainer.run.metrics() if "loss" in line]
-    return {
-        **asdict(cell),
-        "method": TABLES[cell.table].method,
-        "placement": TABLES[cell.table].placement,
-        **{key: results[key] for key in MEASURES},
-        "background_psnr": background_psnr,
-        "foreground_share": share,
-        "outcome": outcome(results["psnr"], background_psnr, share),
-        "dead_at_start": dead,
-        "steps": trainer.next_step,
-        "seconds": round(trainer.elapsed, 3),
-        "cpu_seconds": round(cpu_seconds, 3),
-        "loss_every": every,
-        "loss": [_rounded(line["loss"]) for line in logged if line["step"] % every == 0],
-        "view": png_bytes(views[0]),
-    }
-
-
-def _rounded(value: float, digits: int = 4) -> float:
-    return float(f"{value:.{digits}g}")
+    table = TABLES[cell.table]
+    measured = trial(config_of(cell, preset, data, output_dir), threads)
+    return {**asdict(cell), "method": table.method, "placement": table.placement, **measured}
