@@ -20,7 +20,7 @@ from edge_se_sampler.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.edges import WHITE, edge_strength
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
-from edge_se_sampler.plain_background import PlainBackgrounds, of_the_object
+from edge_se_sampler.plain_background import PlainBackgrounds, summed_up
 from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.ranking import keep_by_rank
 from edge_se_sampler.schedule import Watch, phase_at
@@ -98,7 +98,7 @@ class ImportantPixels:
         if self.watch is None or self.trained_on is None:
             return
         distance = self._backgrounds.squared_distance(self.trained_on, self.background)
-        self.watch.observe(*of_the_object(squared_error.detach(), distance.to(squared_error.device)))
+        self.watch.observe(*summed_up(squared_error.detach(), distance.to(squared_error.device)))
         self.trained_on = None
 
     @property

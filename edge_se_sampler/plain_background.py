@@ -15,17 +15,16 @@ VISIBLE = 0.01
 """A pixel farther than this from the background shows the object: a tenth of the full contrast in one channel."""
 
 
-def of_the_object(error: Tensor, distance: Tensor) -> tuple[int, float, float]:
-    """How many pixels show the object, and their mean squared error and mean distance from the background.
+def summed_up(error: Tensor, distance: Tensor) -> tuple[float, float, float]:
+    """How many pixels show the object; all pixels' mean squared error, and mean distance from the background.
 
     Args:
         error: (n,) squared errors.
         distance: (n,) squared, see `PlainBackgrounds.squared_distance`.
     """
     seen = (distance > VISIBLE).double()
-    sums = torch.stack((seen, seen * error, seen * distance)).sum(dim=1).tolist()
-    count = round(sums[0])
-    return (count, sums[1] / count, sums[2] / count) if count else (0, 0.0, 0.0)
+    count, error_sum, distance_sum = torch.stack((seen, error.double(), distance.double())).sum(dim=1).tolist()
+    return count, error_sum / len(error), distance_sum / len(error)
 
 
 class PlainBackgrounds:

@@ -2,7 +2,8 @@
 
 e   squared error of a pixel that was trained on
 b   squared distance of its colour from the background's: its error in an empty scene
-R   mean e / mean b over the object's pixels that training saw lately: 1 where nothing is learnt, 0 where all is
+R   mean e / mean b of what training saw lately: 1 for an empty scene, 0 where all is learnt. The background's pixels
+    count in e: a fog in front of everything, as networks begin with, is nearer to many an object than its background
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ LEARNT = 0.5
 LOST = 0.8
 """R above this begins it again."""
 WINDOW_STEPS, WINDOW_PIXELS = 16, 256
-"""R forgets after so many steps, or object's pixels if those take longer; a phase lasts that at least."""
+"""R forgets after so many steps, or pixels of the object if those take longer; a phase lasts that at least."""
 
 
 def phase_at(step: int, early_steps: float) -> Phase:
@@ -34,20 +35,20 @@ class Watch:
     def __init__(self) -> None:
         self.phase: Phase = "early"
         self.observations = 0
+        self._count = 0.0
         self._begin("early")
 
-    def observe(self, count: int, error: float, background: float) -> None:
-        """Take note of a step's pixels of the object.
+    def observe(self, count: float, error: float, background: float) -> None:
+        """Take note of a step's pixels.
 
         Args:
-            count: how many there were.
-            error: their mean e.
-            background: their mean b.
+            count: how many show the object.
+            error: mean e of all.
+            background: mean b of all.
         """
         self.observations += 1
-        if not count:
-            return
-        share = min(1 / WINDOW_STEPS, count / WINDOW_PIXELS)
+        self._count += (count - self._count) / min(WINDOW_STEPS, self.observations)
+        share = min(1 / WINDOW_STEPS, self._count / WINDOW_PIXELS)
         self._error += share * (error - self._error)
         self._background += share * (background - self._background)
         self._evidence += share * (1 - self._evidence)

@@ -10,7 +10,7 @@ import torch
 from batches import batch_of, following
 
 from edge_se_sampler.image_batch import ImageBatch
-from edge_se_sampler.plain_background import PlainBackgrounds, of_the_object
+from edge_se_sampler.plain_background import PlainBackgrounds, summed_up
 from edge_se_sampler.schedule import LEARNT, LOST, WINDOW_STEPS, Watch
 
 
@@ -70,10 +70,26 @@ def test_steps_without_the_object_tell_nothing() -> None:
         watch.observe(0, 0.0, 0.0)
     assert watch.phase == "early"
     assert watch.remaining == 1
-    phases(np.full(100, 0.2), watch=watch)
-    before = watch.state()
-    watch.observe(0, 0.0, 0.0)
-    assert watch.state() == before | {"observations": before["observations"] + 1}
+
+
+def test_the_rarer_the_object_the_longer_the_window() -> None:
+    def steps_to_see(count: int) -> int:
+        return phases(np.full(3000, 0.2), count=count).index("late") + 1
+
+    assert steps_to_see(64) == steps_to_see(16) == WINDOW_STEPS  # 1 - (1 - 1/16)^16 > 1 - 1/e
+    assert 250 <= steps_to_see(1) <= 260
+
+
+def test_a_fog_is_not_an_object() -> None:
+    """A grey fog is nearer to a dark object than the white behind it, but hides the white as well."""
+    error, distance = torch.tensor([0.5] * 10 + [0.7] * 30), torch.tensor([2.0] * 10 + [0.0] * 30)
+    count, mean_error, mean_distance = summed_up(error, distance)
+    assert error[:10].mean() < 0.5 * distance[:10].mean()
+    assert mean_error > mean_distance
+    watch = Watch()
+    for _ in range(500):
+        watch.observe(count, mean_error, mean_distance)
+    assert watch.phase == "early"
 
 
 def test_it_goes_on_from_a_state() -> None:
@@ -117,11 +133,9 @@ def test_without_alpha_the_border_tells_the_background(dtype: torch.dtype) -> No
         torch.testing.assert_close(distance, expected * colors.square().sum(dim=1))
 
 
-def test_only_the_object_counts() -> None:
-    error, distance = torch.tensor([0.5, 9.0, 0.1, 7.0]), torch.tensor([1.0, 0.0, 0.5, 0.009])
-    count, mean_error, mean_distance = of_the_object(error, distance)
-    assert (count, mean_error, mean_distance) == (2, pytest.approx(0.3), pytest.approx(0.75))
-    assert of_the_object(error[1:2], distance[1:2]) == (0, 0.0, 0.0)
+def test_a_step_summed_up() -> None:
+    error, distance = torch.tensor([0.5, 9.0, 0.1, 0.4]), torch.tensor([1.0, 0.0, 0.5, 0.009])
+    assert summed_up(error, distance) == (2, pytest.approx(2.5), pytest.approx(1.509 / 4))
 
 
 # -- the sampler under it

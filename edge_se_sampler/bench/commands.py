@@ -1,4 +1,4 @@
-"""The measuring commands: edge-se bench samplers, quality, paper, nerfstudio. Torch-free until one runs."""
+"""The measuring commands: edge-se bench samplers, quality, paper, stability, nerfstudio. Torch-free until one runs."""
 
 from __future__ import annotations
 
@@ -177,9 +177,67 @@ class BenchPaper:
         print(f"{len(result['runs'])} cells; see {self.output_dir / 'report.html'}")
 
 
+@dataclass(frozen=True)
+class BenchStability:
+    """Map where training dies, by strategy and setting; leave result.json, table.md and pictures. Goes on where it
+    was ended."""
+
+    output_dir: Path
+    """Where the result goes; trainings that it already has are kept."""
+    workplace: Path = Path("bench")
+    """Where views of failed trainings are kept, for the sheet."""
+    points: tuple[int, ...] = ()
+    """Numbers of points on the map; none: all. --dry-run tells what they are."""
+    strategies: tuple[str, ...] = ()
+    """Of the paper's six, revived and auto; none: all."""
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Of weights, pixels and jitter."""
+    workers: int | None = None
+    """Trainings at once, a thread each; left out, as many as there are cores."""
+    scheduler: str | None = None
+    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers."""
+    dry_run: tyro.conf.UseCounterAction[int] = 0
+    """Only tell which points there are, and how much is done; trains nothing, writes nothing."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.experiment import begun, default_workers, executor_of, missing, run_cells
+        from edge_se_sampler.bench.stability.point import STRATEGIES, cells, points
+        from edge_se_sampler.bench.stability.summary import write_outputs
+        from edge_se_sampler.bench.stability.train import Scale, run_cell
+        from edge_se_sampler.engine.files import make_folder
+        from edge_se_sampler.show import require_pyplot
+
+        for flag, chosen, known in (
+            ("points", self.points, tuple(range(len(points())))),
+            ("strategies", self.strategies, tuple(STRATEGIES)),
+        ):
+            for name in chosen:
+                if name not in known:
+                    raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
+        if not self.seeds or (self.workers is not None and self.workers < 1):
+            raise InputError("--seeds and --workers: at least one")
+        scale, path = Scale(), self.output_dir / "result.json"
+        todo, result = cells(self.points, self.strategies, self.seeds), begun(path, scale)
+        if self.dry_run:
+            for number in sorted({cell.point for cell in todo}):
+                print(f"point {number:2}: {points()[number].label}")
+            print(f"{len(todo)} trainings of {scale.iterations} steps, {len(missing(todo, result))} still to do")
+            return
+        require_pyplot()
+        new_executor = executor_of(self.workers or default_workers(), self.scheduler)
+        make_folder(self.output_dir, "--output-dir")
+        views = (self.workplace / "stability").resolve()
+        run_cells(todo, result, path, new_executor, run_cell, lambda _: (scale, views))
+        write_outputs(result, views, self.output_dir)
+        for error in result["errors"]:
+            print(f"point {error['point']}, {error['strategy']}, {error['seed']}: {error['error']}")
+        print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
+
+
 BENCHES: dict[str, type] = {
     "samplers": BenchSamplers,
     "quality": BenchQuality,
     "nerfstudio": BenchNerfstudio,
     "paper": BenchPaper,
+    "stability": BenchStability,
 }

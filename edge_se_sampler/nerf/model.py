@@ -36,6 +36,8 @@ class NeRFModel(nn.Module):
         """Of jitter, noise and random backgrounds; the trainer seeds it at every step."""
         self.occupied: Callable[[Tensor], Tensor] | None = None
         """Positions (m, 3) -> (m,) bool; where False, the density is 0 and no network is asked. None: everywhere."""
+        self.background: Callable[[RayBundle], Tensor] | None = None
+        """n rays -> (n, 3) colours behind them; None: what the config says."""
 
     @property
     def device(self) -> torch.device:
@@ -67,7 +69,7 @@ class NeRFModel(nn.Module):
         norm = rays.metadata["directions_norm"]
         jitter = self._uniform(count, samples) if self.training else None
         t = stratified(config.near * norm, config.far * norm, samples, jitter)
-        background = self._background(count)
+        background = self._background(count) if self.background is None else self.background(rays)
         weights, rgb, _ = self._render(self.coarse, rays, t, background)
         outputs = {"rgb_coarse": rgb, "accumulation_coarse": weights.sum(1, keepdim=True), "background": background}
 

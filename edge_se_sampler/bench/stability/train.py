@@ -1,0 +1,172 @@
+"""One training of the map, and how it ended, of the coarse and of the fine network.
+
+share   error on the object as a share of an empty scene's
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from edge_se_sampler.bench.stability.point import STRATEGIES, Cell, Point, points
+from edge_se_sampler.bench.stability.scene import COLORS, behind, views
+from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
+from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render_view
+from edge_se_sampler.engine.files import png_bytes, write_atomically
+from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.revival import LEVELS, dead_networks
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import keep_freed_memory
+from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.nerf.config import NeRFModelConfig
+from edge_se_sampler.nerf.model import NeRFModel, target_colors
+
+Ending = Literal["learnt", "slow", "dead at the start", "killed by the data", "opaque background"]
+LEARNING_RATE = 3e-3
+LOOKS = 10
+"""So often a training is looked at."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large the trainings are."""
+
+    iterations: int = 300
+    rays: int = 64
+    width: int = 64
+    samples: int = 16
+    """Coarse ones, and as many importance samples."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a network shows of held-out views."""
+
+    share: float
+    psnr: float
+    background_psnr: float
+    """Of the empty scene."""
+    accumulation: float
+    """Mean opacity of the rays that meet nothing."""
+
+
+def ending(measured: Measured, dead_at_start: bool) -> Ending:
+    """How a training ended.
+
+    Nothing learnt (share > 0.9): it began without a gradient, or is empty, or hides everything behind an opaque
+    background. Less than 0.5 dB better than the empty scene: slow.
+    """
+    if measured.share > 0.9:
+        if dead_at_start:
+            return "dead at the start"
+        return "opaque background" if measured.accumulation > 0.5 else "killed by the data"
+    return "slow" if measured.psnr < measured.background_psnr + 0.5 else "learnt"
+
+
+def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Path) -> tuple[Trainer, list[Picture]]:
+    """A point's training, about to begin, and its held-out views."""
+    chosen = STRATEGIES[strategy]
+    train, test = views(point.foreground, point.placement == "shifted", 40)
+    model = NeRFModelConfig(
+        "tiny", width=scale.width, depth=point.depth, num_coarse_samples=scale.samples,
+        num_importance_samples=scale.samples, density_activation=point.activation,
+        initialization=point.initialization, density_noise=point.noise,
+        background_color="random" if point.background == "random" else "white",
+    )  # fmt: skip
+    config: TrainerConfig = registered_methods()["edge-se-nerf"].specification.config
+    settings: dict[str, Any] = {"early": chosen.early, "late": chosen.late, "schedule": chosen.schedule}
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
+    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=scale.rays, pixel_sampler=sampler)
+    config = replace(
+        config,
+        output_dir=folder,
+        experiment_name="stability",
+        max_num_iterations=scale.iterations,
+        machine=MachineConfig(seed=seed, device_type="cpu"),
+        optimizer=replace(config.optimizer, lr=LEARNING_RATE * point.rate),
+        pipeline=replace(config.pipeline, datamanager=manager, model=model),
+        revive=chosen.revive,
+    )
+    train = train.subset(range(point.views))
+    config = planned(config, train)
+    pipeline = Pipeline.build(config, train, "cpu")
+    pipeline.model.background = behind(point.background)
+    pipeline.datamanager.train_pixel_sampler.background = COLORS.get(point.background, COLORS["white"])
+    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), pictures_of(test)
+
+
+def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
+    """Train a cell and judge it; runs in a process of its own.
+
+    Returns:
+        its place, of each network how it ended and what it shows, the fine one's share at LOOKS times, how many
+        networks began anew, CPU seconds. A failed one's first held-out view goes to views_folder.
+    """
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    point = points()[cell.point]
+    began = time.process_time()
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
+        trainer, pictures = trainer_of(point, cell.strategy, cell.seed, scale, Path(folder))
+        model = trainer.pipeline.model
+        probe = [picture.rays(model.device)[::2] for picture in pictures]
+        dead, shares = dead_networks(model, probe), []
+        for step in range(scale.iterations):
+            trainer.train_iteration(step)
+            if (step + 1) % max(1, scale.iterations // LOOKS) == 0:
+                shares.append(round(measured(model, pictures, "fine", stride=5).share, 4))
+        revived = trainer.revival.used if trainer.revival is not None else 0
+    told: dict[str, Any] = {}
+    for level in LEVELS:
+        shown = measured(model, pictures, level)
+        told |= {f"{level}_ending": ending(shown, level in dead)}
+        told |= {f"{level}_{key}": round(value, 4) for key, value in asdict(shown).items()}
+    if told["fine_ending"] != "learnt":
+        views_folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(views_folder / f"{cell.name}.png", png_bytes(render_view(model, pictures[0])[0]))
+    return {
+        **asdict(cell),
+        **point.changes,
+        "outcome": told["fine_ending"],
+        **told,
+        "dead_at_start": dead,
+        "revived": revived,
+        "shares": shares,
+        "cpu_seconds": round(time.process_time() - began, 2),
+    }
+
+
+@torch.no_grad()
+def measured(model: NeRFModel, pictures: list[Picture], level: str, stride: int = 1) -> Measured:
+    """A network ("coarse" or "fine") against the held-out views, every stride-th pixel."""
+    was_training = model.training
+    model.eval()
+    errors, distances, accumulations, alphas = [], [], [], []
+    for picture in pictures:
+        rays = picture.rays(model.device)[::stride]
+        image = torch.from_numpy(picture.image).reshape(-1, 4)[::stride]
+        for rows in model.chunks(len(rays)):
+            outputs = model(rays[rows])
+            errors.append(model.squared_error(outputs, image[rows], level))
+            behind_it = outputs["background"]
+            distances.append((target_colors(image[rows], behind_it) - behind_it).square().sum(dim=1))
+            accumulations.append(outputs[f"accumulation_{level}"][:, 0])
+        alphas.append(image[:, 3])
+    model.train(was_training)
+    error, distance, accumulation, alpha = map(torch.cat, (errors, distances, accumulations, alphas))
+    inside = alpha > 0
+    return Measured(
+        share=float(error[inside].sum() / distance[inside].sum()),
+        psnr=psnr(float(error.mean() / 3)),
+        background_psnr=psnr(float(distance.mean() / 3)),
+        accumulation=float(accumulation[~inside].mean()),
+    )
