@@ -98,7 +98,8 @@ class ImportantPixels:
         if self.watch is None or self.trained_on is None:
             return
         distance = self._backgrounds.squared_distance(self.trained_on, self.background)
-        self.watch.observe(*summed_up(squared_error.detach(), distance.to(squared_error.device)))
+        by_edge, relative = self.strategy == "edge", self.trained_on["relative"]
+        self.watch.observe(*summed_up(squared_error.detach(), distance, relative, by_edge))
         self.trained_on = None
 
     @property
@@ -165,17 +166,15 @@ class ImportantPixels:
             self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
         for over in set(self._tables) - {strategy, "uniform"} if self.watch is None else ():
             del self._tables[over]  # the early phase is over for good: give its memory back
-        self.trained_on = None  # candidates are not
+        self.trained_on = None
         if strategy == "se":
             pixels = self._candidates(batch, count)
         else:
-            pixels, weight = self._draw(batch, strategy, count)
-            pixels = batch.gather(pixels)
+            drawn, weight = self._draw(batch, strategy, count)
+            pixels = batch.gather(drawn)
+            self._watch(batch, drawn, pixels)
             if weight is not None:
                 pixels["weight"] = weight
-        if self.watch is not None:
-            self._backgrounds.look_at(batch)
-            self.trained_on = {key: pixels[key] for key in ("indices", "image")}
         if self.config.keep_full_image:
             pixels["full_image"] = image_batch["image"]
         return pixels
@@ -227,6 +226,14 @@ class ImportantPixels:
             raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
         return source, places, drawable
 
+    def _watch(self, batch: ImageBatch, drawn: Tensor, pixels: dict[str, Any]) -> None:
+        """Under "auto", keep what `observe` will need of drawn pixels."""
+        if self.watch is not None:
+            self._backgrounds.look_at(batch)
+            source, places = self.distribution(batch, "edge")
+            self.trained_on = {key: pixels[key] for key in ("indices", "image")}
+            self.trained_on["relative"] = source.relative(places, drawn.cpu())
+
     def _candidates(self, batch: ImageBatch, count: int) -> dict[str, Any]:
         """Score uniform candidates and keep `count` of them by rank."""
         assert self._squared_error is not None
@@ -236,6 +243,8 @@ class ImportantPixels:
             errors = self._squared_error(candidates)
         if errors.shape != (len(drawn),):
             raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
+        self._watch(batch, drawn, candidates)
+        self.observe(errors)
         kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION, self._rank))
         pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
         if self.config.importance_weight:

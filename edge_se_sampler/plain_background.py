@@ -15,16 +15,24 @@ VISIBLE = 0.01
 """A pixel farther than this from the background shows the object: a tenth of the full contrast in one channel."""
 
 
-def summed_up(error: Tensor, distance: Tensor) -> tuple[float, float, float]:
-    """How many pixels show the object; all pixels' mean squared error, and mean distance from the background.
+def summed_up(error: Tensor, distance: Tensor, relative: Tensor, by_edge: bool) -> tuple[float, float, float, float]:
+    """What a step's pixels say of both ways of drawing, by importance weights (see `schedule`).
 
     Args:
-        error: (n,) squared errors.
-        distance: (n,) squared, see `PlainBackgrounds.squared_distance`.
+        error: (n,) e.
+        distance: (n,) b, see `PlainBackgrounds.squared_distance`.
+        relative: (n,) p / u.
+        by_edge: whether edge sampling drew them; else uniform sampling did.
+
+    Returns:
+        how many show the object, E[e], E[b], U[e].
     """
-    seen = (distance > VISIBLE).double()
-    count, error_sum, distance_sum = torch.stack((seen, error.double(), distance.double())).sum(dim=1).tolist()
-    return count, error_sum / len(error), distance_sum / len(error)
+    error, distance, relative = (values.double().to(error.device) for values in (error, distance, relative))
+    as_edge, as_uniform = (1, 1 / relative) if by_edge else (relative, 1)
+    sums = torch.stack(((distance > VISIBLE).double(), error * as_edge, distance * as_edge, error * as_uniform))
+    count, *totals = sums.sum(dim=1).tolist()
+    edge_error, edge_background, uniform_error = (total / len(error) for total in totals)
+    return count, edge_error, edge_background, uniform_error
 
 
 class PlainBackgrounds:

@@ -22,8 +22,8 @@ class SamplingSettings:
     late: Literal["uniform", "se"] = "se"
     """How pixels are drawn afterwards: all alike, or by the rank of their squared error among uniform candidates."""
     schedule: Literal["fraction", "steps", "auto"] = "fraction"
-    """What ends the early phase: a share of the planned iterations; a number of steps; or that training has learnt
-    the object (and it begins again if that is lost)."""
+    """What ends the early phase: a share of the planned iterations; a number of steps; or, for edge sampling, that the
+    object is learnt and edges no longer pay (it begins again where the object is lost, or they do)."""
     early_fraction: float = 0.1
     """Share of the planned iterations that the early phase lasts (schedule: fraction); the paper's 1/10."""
     early_steps: int = 0
@@ -60,6 +60,8 @@ class SamplingSettings:
             refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
         if self.schedule != "steps" and self.early_steps:
             refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
+        if self.schedule == "auto" and self.early != "edge":
+            refuse("schedule", "'auto' asks whether edges pay: it needs early edge")
         if not 0 < self.edge_epsilon < float("inf"):
             refuse("edge_epsilon", "must be above 0 (0 would never train flat regions)")
         if self.se_candidates < 2:

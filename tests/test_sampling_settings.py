@@ -47,6 +47,7 @@ def test_a_sampler_refuses_them_when_it_is_made(flag: str, settings: dict[str, A
         {"early_fraction": 0},
         {"early_fraction": 1},
         {"schedule": "steps", "early_steps": 1},
+        {"schedule": "auto"},
         {"edge_epsilon": 1e-30},
         {"se_candidates": 2},
         {"importance_weight": 1.0},

@@ -9,18 +9,20 @@ import pytest
 import torch
 from batches import batch_of, following
 
+from edge_se_sampler.distribution import PixelTable, UniformPixels
 from edge_se_sampler.image_batch import ImageBatch
 from edge_se_sampler.plain_background import PlainBackgrounds, summed_up
-from edge_se_sampler.schedule import LEARNT, LOST, WINDOW_STEPS, Watch
+from edge_se_sampler.schedule import LEARNT, LOST, PAYS_AGAIN, PAYS_NO_MORE, WINDOW_STEPS, Watch
 
 
-def phases(remaining: Any, count: int = 64, noise: float = 0.0, watch: Watch | None = None) -> list[str]:
-    """The phase after each step of a trace of R, the object's error as a share of an empty scene's."""
+def phases(remaining: Any, count: int = 64, noise: float = 0.0, watch: Watch | None = None, gain: float = 1.0) -> Any:
+    """The phase after each step of a trace of R, the error as a share of an empty scene's; gain is E[e] / U[e]."""
     watch, rng = watch or Watch(), np.random.default_rng(0)
     told = []
     for share in remaining:
         background = float(rng.uniform(0.2, 0.8)) if noise else 0.5  # images differ
-        watch.observe(count, share * background * float(np.exp(noise * rng.normal())), background)
+        error = share * background * float(np.exp(noise * rng.normal()))
+        watch.observe(count, error, background, error / gain)
         told.append(watch.phase)
     return told
 
@@ -67,7 +69,7 @@ def test_between_the_bounds_a_phase_stays_what_it_was() -> None:
 def test_steps_without_the_object_tell_nothing() -> None:
     watch = Watch()
     for _ in range(1000):
-        watch.observe(0, 0.0, 0.0)
+        watch.observe(0, 0.0, 0.0, 0.0)
     assert watch.phase == "early"
     assert watch.remaining == 1
 
@@ -83,13 +85,25 @@ def test_the_rarer_the_object_the_longer_the_window() -> None:
 def test_a_fog_is_not_an_object() -> None:
     """A grey fog is nearer to a dark object than the white behind it, but hides the white as well."""
     error, distance = torch.tensor([0.5] * 10 + [0.7] * 30), torch.tensor([2.0] * 10 + [0.0] * 30)
-    count, mean_error, mean_distance = summed_up(error, distance)
+    said = summed_up(error, distance, torch.ones(40), True)
     assert error[:10].mean() < 0.5 * distance[:10].mean()
-    assert mean_error > mean_distance
     watch = Watch()
     for _ in range(500):
-        watch.observe(count, mean_error, mean_distance)
+        watch.observe(*said)
     assert watch.phase == "early"
+
+
+def test_edges_last_while_they_pay() -> None:
+    learnt = np.full(300, 0.2)
+    assert set(phases(learnt, gain=PAYS_NO_MORE + 0.1)) == {"early"}
+    assert phases(learnt, gain=PAYS_NO_MORE - 0.1)[-1] == "late"
+
+
+def test_edges_begin_again_when_they_pay_again() -> None:
+    watch = Watch()
+    assert phases(np.full(100, 0.2), watch=watch)[-1] == "late"
+    assert set(phases(np.full(100, 0.2), watch=watch, gain=PAYS_AGAIN - 0.1)) == {"late"}
+    assert phases(np.full(100, 0.2), watch=watch, gain=PAYS_AGAIN + 0.1)[-1] == "early"
 
 
 def test_it_goes_on_from_a_state() -> None:
@@ -135,7 +149,36 @@ def test_without_alpha_the_border_tells_the_background(dtype: torch.dtype) -> No
 
 def test_a_step_summed_up() -> None:
     error, distance = torch.tensor([0.5, 9.0, 0.1, 0.4]), torch.tensor([1.0, 0.0, 0.5, 0.009])
-    assert summed_up(error, distance) == (2, pytest.approx(2.5), pytest.approx(1.509 / 4))
+    relative = torch.tensor([4.0, 0.5, 2.0, 1.0])
+    assert summed_up(error, distance, relative, False) == (
+        2,
+        pytest.approx((2 + 4.5 + 0.2 + 0.4) / 4),
+        pytest.approx((4 + 0 + 1 + 0.009) / 4),
+        pytest.approx(2.5),
+    )
+    assert summed_up(error, distance, relative, True) == (
+        2,
+        pytest.approx(2.5),
+        pytest.approx(1.509 / 4),
+        pytest.approx((0.125 + 18 + 0.05 + 0.4) / 4),
+    )
+
+
+def test_both_ways_of_drawing_tell_the_same() -> None:
+    """E[e], E[b] and U[e] from a hundred thousand pixels drawn either way, and exactly from all of them."""
+    rng = np.random.default_rng(0)
+    strength = torch.from_numpy(rng.random((40, 30)) ** 3 + 0.01)
+    error, distance = rng.random((40, 30)), rng.random((40, 30))
+    p = (strength / strength.sum()).numpy()
+    truth = [float((p * error).sum()), float((p * distance).sum()), float(error.mean())]
+    table = PixelTable()
+    table.add([strength])
+    for source, by_edge in ((table, True), (UniformPixels([(40, 30)]), False)):
+        drawn = source.draw(torch.tensor([0]), 100_000, np.random.default_rng(1))
+        at = (drawn[:, 1].numpy(), drawn[:, 2].numpy())
+        relative = table.relative(torch.tensor([0]), drawn)
+        _, *said = summed_up(torch.from_numpy(error[at]), torch.from_numpy(distance[at]), relative, by_edge)
+        assert said == pytest.approx(truth, rel=0.02), by_edge
 
 
 # -- the sampler under it
@@ -145,6 +188,12 @@ def auto(**settings: Any) -> Any:
     return following(schedule="auto", rays=64, **settings)
 
 
+def away(image: torch.Tensor) -> torch.Tensor:
+    """An empty scene's errors."""
+    image = image.float() / 255
+    return (image[:, 3:] * (image[:, :3] - 1)).square().sum(dim=1)
+
+
 def trained(sampler: Any, share: float, steps: int = 40) -> list[str]:
     """Strategies of steps whose errors are this share of an empty scene's."""
     told = []
@@ -152,8 +201,9 @@ def trained(sampler: Any, share: float, steps: int = 40) -> list[str]:
     for step in range(steps):
         sampler.set_step(step)
         told.append(sampler.strategy)
-        image = sampler.sample(host)["image"].float() / 255
-        sampler.observe(share * (image[:, 3:] * (image[:, :3] - 1)).square().sum(dim=1))
+        batch = sampler.sample(host)
+        sampler._squared_error = lambda c: share * away(c["image"])
+        sampler.observe(share * away(batch["image"]))
     return told
 
 
@@ -166,22 +216,28 @@ def test_the_sampler_follows_the_watch() -> None:
     assert trained(sampler, 1.0)[-1] == "edge"  # lost: its tables are still there, or made again
 
 
-def test_candidates_are_not_what_was_trained_on() -> None:
-    """Scoring happens before there is a batch: what is then observed is nobody's."""
+def test_in_the_late_phase_the_candidates_tell() -> None:
+    """They are uniform, and twice as many; what was chosen of them is not asked."""
     sampler = auto()
     trained(sampler, 0.2)
     assert sampler.strategy == "se"
-    before = sampler.watch.state()
-    sampler._squared_error = lambda candidates: (
-        sampler.observe(torch.ones(len(candidates["indices"]))),
-        candidates["image"].float().mean(dim=1),
-    )[1]
-    sampler.sample(batch_of(channels=4))
-    assert sampler.watch.state() == before
-    sampler.observe(torch.zeros(64))
-    after = sampler.watch.state()
-    sampler.observe(torch.zeros(64))  # and once only
-    assert sampler.watch.state() == after != before
+    seen, before = [], sampler.watch.observations
+    observe = sampler.watch.observe
+    sampler.watch.observe = lambda *said: (seen.append(said), observe(*said))
+    batch = sampler.sample(batch_of(channels=4))
+    assert len(batch["indices"]) == 64
+    assert sampler.watch.observations == before + 1
+    assert seen[0][0] > 64  # of 128 random pixels nearly all are visible
+    sampler.observe(torch.zeros(64))  # nobody waits for it
+    assert sampler.watch.observations == before + 1
+
+
+def test_a_late_uniform_phase_is_watched_as_it_trains() -> None:
+    sampler = auto(late="uniform")
+    told = trained(sampler, 0.2, steps=60)
+    assert told[-1] == "uniform"
+    assert sampler.watch.observations == 60
+    assert trained(sampler, 1.0, steps=60)[-1] == "edge"
 
 
 def test_other_schedules_watch_nothing() -> None:

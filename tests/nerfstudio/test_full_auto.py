@@ -58,8 +58,9 @@ def test_every_training_batch_is_observed_once(name: str, alpha: str | None, hos
     assert told == rendered
     sampler.watch.phase = "late"
     trainer._start_step = 3
-    train(trainer, 2)  # with candidates scored before each
+    train(trainer, 2)  # the candidates tell, and once a step
     assert len(told) == 5
+    assert sampler.watch.observations == 5
 
 
 def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
