@@ -114,6 +114,23 @@ def test_rescue_is_judged_where_the_other_fails(theirs: set[str], ours: set[str]
     assert verdict(runs, "Off centre, Edge trains") == expected
 
 
+def test_two_dead_runs_tell_nothing_of_quality() -> None:
+    def dies(table: int, strategy: str, scene: str) -> bool:
+        return scene != "mic"
+
+    levels = {(1, "vanilla-nerf"): 30.0, (1, "se-nerf"): 30.5}
+    (claim,) = [c for c in verdicts(experiment(levels, dies)) if c["text"].endswith("at equal steps")]
+    (row,) = claim["comparisons"]
+    assert (row["runs"], row["pairs"], row["failures"], row["scenes"]) == (3, 21, 18, 1)
+    assert row["mean"] == pytest.approx(0.5, abs=0.2)
+    everywhere = verdicts(experiment(levels, lambda *_: True))
+    (claim,) = [c for c in everywhere if c["text"].endswith("at equal steps")]
+    assert claim["verdict"] == "nothing to compare"
+    assert "| SE against Random, table 1 | – |" in markdown(experiment(levels, lambda *_: True), everywhere)
+    both = experiment(levels | {(2, "vanilla-nerf"): 30.0, (2, "se-nerf"): 30.5}, lambda table, *_: table == 2)
+    assert verdict(both, "SE raises PSNR whatever the early phase, at equal steps") == "supported"
+
+
 def test_a_gain_with_few_views_is_a_difference_of_differences() -> None:
     same = {(1, "edge-nerf"): 31.0, (1, "precrop-nerf"): 30.0, (5, "edge-nerf"): 21.0, (5, "precrop-nerf"): 20.0}
     assert verdict(experiment(same), "With few views, Edge gains more") == "not supported"

@@ -55,7 +55,7 @@ class PairedDifference:
 
 
 def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDifference:
-    """Of (scene, d) of every pair, at least one.
+    """Of (scene, d) of every pair; of none, all is 0 and unknown.
 
     The scenes are what they are and seeds are drawn: only the deviation between a scene's seeds counts, pooled over
     the scenes. The interval is about these scenes, not about others.
@@ -63,6 +63,8 @@ def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDiffere
     by_scene: dict[str, list[float]] = {}
     for scene, difference in differences:
         by_scene.setdefault(scene, []).append(difference)
+    if not by_scene:
+        return PairedDifference(0.0, None, None, None, 0, 0, 0)
     means = {scene: statistics.mean(values) for scene, values in by_scene.items()}
     mean, runs = statistics.mean(means.values()), sum(map(len, by_scene.values()))
     better = sum(value > 0 for value in means.values())

@@ -38,23 +38,25 @@ class Experiment:
     views: Path
 
     @property
-    def seed(self) -> int:
-        """The first, whose views are shown."""
-        return min(run["seed"] for run in self.runs)
+    def seeds(self) -> list[int]:
+        """In order; views are shown of the first."""
+        return sorted({run["seed"] for run in self.runs})
 
-    def run(self, table: int, scene: str, strategy: str) -> dict[str, Any] | None:
-        """The first seed's, if there is one."""
-        place = {"table": table, "scene": scene, "strategy": strategy, "seed": self.seed}
+    def run(self, table: int, scene: str, strategy: str, seed: int | None = None) -> dict[str, Any] | None:
+        """A cell's run, if there is one."""
+        seed = self.seeds[0] if seed is None else seed
+        place = {"table": table, "scene": scene, "strategy": strategy, "seed": seed}
         return next((run for run in self.runs if all(run[key] == value for key, value in place.items())), None)
 
-    def rendering(self, table: int, scene: str, strategy: str) -> np.ndarray | None:
+    def rendering(self, table: int, scene: str, strategy: str, seed: int | None = None) -> np.ndarray | None:
         """(H, W, 3) in [0, 1], if it was kept."""
-        path = self.views / f"{Cell(table, scene, strategy, self.seed).name}.png"
+        seed = self.seeds[0] if seed is None else seed
+        path = self.views / f"{Cell(table, scene, strategy, seed).name}.png"
         return unit_float(iio.imread(path)) if path.exists() else None
 
     def images(self, table: int, scene: str, split: Any = "test") -> Views:
         """The scene as the table's cells saw it."""
-        return read_blender(self.data_of(Cell(table, scene, "edge-nerf", self.seed)), split)
+        return read_blender(self.data_of(Cell(table, scene, "edge-nerf", 0)), split)
 
     def truth(self, table: int, scene: str) -> np.ndarray:
         """(H, W, 3): the first held-out view on white."""
@@ -123,17 +125,17 @@ def _sheet(experiment: Experiment) -> Any:
 
 
 def _figure_2(experiment: Experiment) -> Any:
-    """What Precrop's window sees of a centred and of an off-centre object, and what it comes to."""
+    """What Precrop's window sees of a centred and of an off-centre object, and what it comes to, seed by seed."""
     scenes = [s for s in ("mic", "drums") if all(experiment.run(t, s, "precrop-nerf") for t in (1, 2))]
     if not scenes:
         return None
     tables = [t for t in (1, 16, 2) if all(experiment.run(t, s, "precrop-nerf") for s in scenes)]
+    places, seeds = [(scene, table) for scene in scenes for table in tables], experiment.seeds[:3]
     figure, axes = require_pyplot().subplots(
-        2, len(scenes) * len(tables), figsize=(2.1 * len(scenes) * len(tables), 4.9), squeeze=False
+        1 + len(seeds), len(places), figsize=(2.0 * len(places), 2.3 * (1 + len(seeds))), squeeze=False
     )
-    columns = zip(axes.T, [(scene, table) for scene in scenes for table in tables], strict=True)
     titles = {1: "centred", 16: "smaller, in the middle", 2: "as small, off centre"}
-    for column, (scene, table) in columns:
+    for column, (scene, table) in zip(axes.T, places, strict=True):
         image = unit_float(experiment.images(table, scene, "train").images[0])
         height, width = image.shape[:2]
         window = (slice(height // 4, 3 * height // 4), slice(width // 4, 3 * width // 4))
@@ -141,11 +143,15 @@ def _figure_2(experiment: Experiment) -> Any:
         _outline(column[0], window)
         column[0].set_title(f"{scene}, {titles[table]}", fontsize=9)
         if image.shape[2] == 4:
-            inside = (image[(*window, 3)] > 0).mean()
-            column[0].set_xlabel(f"{inside:.0%} of the window is object", fontsize=8)
-        run = experiment.run(table, scene, "precrop-nerf") or {}
-        _show(column[1], experiment.rendering(table, scene, "precrop-nerf"), FAILED if failed(run) else "#cccccc")
-        column[1].set_xlabel(f"Precrop: {run['psnr']:.2f} dB (background {run['background_psnr']:.2f})", fontsize=8)
+            column[0].set_xlabel(f"{(image[(*window, 3)] > 0).mean():.0%} of the window is object", fontsize=8)
+        for axis, seed in zip(column[1:], seeds, strict=True):
+            run = experiment.run(table, scene, "precrop-nerf", seed)
+            if run is not None:
+                picture = experiment.rendering(table, scene, "precrop-nerf", seed)
+                _show(axis, picture, FAILED if failed(run) else "#cccccc")
+                axis.set_xlabel(f"{run['psnr']:.2f} dB (background {run['background_psnr']:.2f})", fontsize=8)
+    for axis, label in zip(axes[:, 0], ("a training view", *(f"Precrop, seed {seed}" for seed in seeds)), strict=True):
+        axis.set_ylabel(label, fontsize=9)
     figure.tight_layout()
     return figure
 

@@ -15,7 +15,7 @@ from edge_se_sampler.bench.paper.verdict import failed
 
 CAPTIONS = {
     "sheet": "The first held-out view of every scene as every strategy rendered it, first seed; red: failed.",
-    "figure-2": "The paper's figure 2. Precrop's window on a training view, and what it led to.",
+    "figure-2": "The paper's figure 2. Precrop's window on a training view, and what it led to; red: failed.",
     "figure-5": "The paper's figure 5. Training loss of Random, Precrop and Edge; every seed is a line.",
     "figure-6": "The paper's figure 6. Error in the edge band, Precrop against Edge.",
 }
@@ -75,14 +75,14 @@ def report(result: dict[str, Any], figures: list[Path]) -> str:
 
 
 def _claim(claim: dict[str, Any]) -> str:
-    head = ("", "difference", "failures", "theirs", "pairs", "could show", "scenes for it", "")
+    head = ("", "difference", "failures", "theirs", "pairs, of", "could show", "scenes for it", "")
     rows = [
         (
             row["label"] + (" (edge band)" if row["measure"] == "edge_band_psnr" else ""),
             interval(row),
             str(row["failures"]),
             str(row["their_failures"]),
-            str(row["runs"]),
+            f"{row['runs']}, {row['pairs']}",
             "–" if row["detectable"] is None else f"{row['detectable']:.2f}",
             f"{row['scenes_better']} of {row['scenes']}",
             row["verdict"],

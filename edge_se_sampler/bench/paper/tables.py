@@ -16,7 +16,8 @@ LEGEND = (
 )
 VERDICT_LEGEND = (
     "Paired differences of runs of the same scene and seed, in dB, with their 95 % interval over seeds, for these "
-    "scenes; failures out of as many pairs; the smallest true difference that so many runs find with 80 % power."
+    "scenes, over the pairs in which not both failed; failures of either side out of all pairs; the smallest true "
+    "difference that so many runs find with 80 % power."
 )
 
 
@@ -87,6 +88,8 @@ def _entry(runs: list[dict[str, Any]], theirs: float | None) -> Entry | None:
 
 def interval(row: dict[str, Any]) -> str:
     """A comparison's mean difference with its interval."""
+    if not row["runs"]:
+        return "–"
     if row["low"] is None:
         return f"{row['mean']:+.2f}"
     return f"{row['mean']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"
@@ -102,11 +105,12 @@ def markdown(runs: list[dict[str, Any]], told: list[dict[str, Any]]) -> str:
     if told:
         parts.append(f"**Verdicts.** {VERDICT_LEGEND}")
     for claim in told:
-        lines = ["| | difference | failures | theirs | pairs | could show | scenes for it | |", "|---" * 8 + "|"]
+        lines = ["| | difference | failures | theirs | pairs, of | could show | scenes for it | |", "|---" * 8 + "|"]
         for row in claim["comparisons"]:
             could = "–" if row["detectable"] is None else f"{row['detectable']:.2f}"
             lines.append(
-                f"| {row['label']} | {interval(row)} | {row['failures']} | {row['their_failures']} | {row['runs']} | "
+                f"| {row['label']} | {interval(row)} | {row['failures']} | {row['their_failures']} | "
+                f"{row['runs']}, {row['pairs']} | "
                 f"{could} | {row['scenes_better']} of {row['scenes']} | {row['verdict']} |"
             )
         parts.append(f"{claim['text']} ({claim['source']}): **{claim['verdict']}**\n\n" + "\n".join(lines))

@@ -21,7 +21,7 @@ LABEL: dict[str, str] = dict(zip(STRATEGIES, LABELS, strict=True))
 
 Arm = tuple[int, str]  # table, strategy
 Kind = Literal["better", "not worse", "rescues"]
-Verdict = Literal["supported", "not supported", "undecided"]
+Verdict = Literal["supported", "not supported", "undecided", "nothing to compare"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Claim:
-    """Holds if every one of its comparisons does.
+    """Holds if every one of its comparisons does that has anything to compare.
 
     "better": the interval lies above 0. "not worse": it lies above -0.3 dB, and there are no more failures.
     "rescues": no run fails on a scene where most of the others' do.
@@ -160,9 +160,10 @@ def verdicts(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _all(parts: list[Verdict]) -> Verdict:
+    parts = [part for part in parts if part != "nothing to compare"] or ["nothing to compare"]
     if "not supported" in parts:
         return "not supported"
-    return "undecided" if "undecided" in parts else "supported"
+    return "undecided" if "undecided" in parts else parts[0]
 
 
 def _compared(comparison: Comparison, kind: Kind, place: dict[Any, dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -173,10 +174,13 @@ def _compared(comparison: Comparison, kind: Kind, place: dict[Any, dict[str, Any
     pairs = [pair for pair in groups if len(pair) == len(arms) and all(run[comparison.measure] for run in pair)]
     if not pairs:
         return
-    difference = paired_difference([(pair[0]["scene"], _difference(pair, comparison.measure)) for pair in pairs])
     failures = [sum(failed(pair[i]) for pair in pairs) for i in (0, 1)]
+    telling = [pair for pair in pairs if not _both_failed(pair)]
+    difference = paired_difference([(pair[0]["scene"], _difference(pair, comparison.measure)) for pair in telling])
     if kind == "rescues":
         verdict = _rescued(pairs)
+    elif not telling:
+        verdict = "nothing to compare"
     else:
         verdict = _judged(kind, difference.low, difference.high, difference.detectable)
         if kind == "not worse" and failures[0] > failures[1]:
@@ -185,10 +189,16 @@ def _compared(comparison: Comparison, kind: Kind, place: dict[Any, dict[str, Any
         "label": comparison.label,
         "measure": comparison.measure,
         **asdict(difference),
+        "pairs": len(pairs),
         "failures": failures[0],
         "their_failures": failures[1],
         "verdict": verdict,
     }
+
+
+def _both_failed(pair: list[dict[str, Any]]) -> bool:
+    """Two dead runs show the same background: that says nothing of how good either way of sampling is."""
+    return any(failed(ours) and failed(theirs) for ours, theirs in zip(pair[::2], pair[1::2], strict=True))
 
 
 def _difference(pair: list[dict[str, Any]], measure: str) -> float:
