@@ -1,4 +1,4 @@
-"""The measuring commands: edge-se bench samplers, quality, paper, stability, nerfstudio. Torch-free until one runs."""
+"""The measuring commands, edge-se bench NAME. Torch-free until one runs."""
 
 from __future__ import annotations
 
@@ -234,10 +234,59 @@ class BenchStability:
         print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
 
 
+@dataclass(frozen=True)
+class BenchSchedule:
+    """Put schedule auto to the test: failures of 280 runs paired with Random's, and PSNR over planned lengths against
+    fixed ones; leave result.json, table.md and lengths.png. Goes on where it was ended."""
+
+    output_dir: Path
+    """Where the result goes; trainings that it already has are kept."""
+    workplace: Path = Path("bench")
+    """Where scenes and runs are kept."""
+    parts: tuple[Literal["failures", "lengths"], ...] = ("failures", "lengths")
+    """Which of the two tests."""
+    failure_seeds: tuple[int, ...] = tuple(range(10))
+    """Of the runs that may fail."""
+    length_seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the runs over planned lengths; the fixed length is chosen on seeds 100 and 101."""
+    workers: int | None = None
+    """Trainings at once, a thread each; left out, as many as there are cores."""
+    scheduler: str | None = None
+    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.experiment import begun, default_workers, executor_of, run_cells
+        from edge_se_sampler.bench.paper.cell import PRESETS
+        from edge_se_sampler.bench.paper.scenes import made_scenes
+        from edge_se_sampler.bench.schedule.cell import Scale, failure_cells, length_cells, run_cell
+        from edge_se_sampler.bench.schedule.summary import write_outputs
+        from edge_se_sampler.engine.files import make_folder
+        from edge_se_sampler.show import require_pyplot
+
+        workers = default_workers() if self.workers is None else self.workers
+        if not (self.parts and self.failure_seeds and self.length_seeds and workers > 0):
+            raise InputError("--parts, --failure-seeds, --length-seeds and --workers: at least one")
+        scale, path = Scale(), self.output_dir / "result.json"
+        todo = failure_cells(scale, self.failure_seeds) if "failures" in self.parts else []
+        todo += length_cells(self.length_seeds) if "lengths" in self.parts else []
+        result = begun(path, scale)
+        require_pyplot()
+        new_executor = executor_of(workers, self.scheduler)
+        make_folder(self.output_dir, "--output-dir")
+        data_of = made_scenes(PRESETS["cpu"], todo, self.workplace)
+        runs = self.workplace / "runs"
+        run_cells(todo, result, path, new_executor, run_cell, lambda cell: (data_of(cell), runs))
+        write_outputs(result, self.output_dir)
+        for error in result["errors"]:
+            print(f"{error['part']}, table {error['table']}, {error['scene']}, {error['arm']}: {error['error']}")
+        print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
+
+
 BENCHES: dict[str, type] = {
     "samplers": BenchSamplers,
     "quality": BenchQuality,
     "nerfstudio": BenchNerfstudio,
     "paper": BenchPaper,
     "stability": BenchStability,
+    "schedule": BenchSchedule,
 }

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from edge_se_sampler.bench.paper.cell import TABLES, Cell, Placement, Preset
 from edge_se_sampler.bench.paper.published import SCENES
@@ -14,10 +15,11 @@ from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 
-DataOf = Callable[[Cell], Path]
+DataOf = Callable[[Any], Path]
+"""A cell, of this bench or any that has a table and a scene -> its Blender folder."""
 
 
-def made_scenes(preset: Preset, cells: list[Cell], workplace: Path) -> DataOf:
+def made_scenes(preset: Preset, cells: Sequence[Any], workplace: Path) -> DataOf:
     """Make what the cells need and workplace/scenes does not have; where each cell's lies."""
     placements: list[Placement] = sorted({TABLES[cell.table].placement for cell in cells})
     for placement in placements:
