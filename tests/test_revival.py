@@ -11,6 +11,7 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_rays, tiny_views
 
+from edge_se_sampler import schedule
 from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
@@ -24,9 +25,13 @@ from edge_se_sampler.nerf.model import NeRFModel
 VIEWS = tiny_views(3, 12, 12)
 
 
-def trainer_of(folder: Path, method: str = "vanilla-nerf", *, revive: bool = True, seed: int = 0) -> Trainer:
+def trainer_of(
+    folder: Path, method: str = "vanilla-nerf", *, revive: bool = True, seed: int = 0, schedule: str = "fraction"
+) -> Trainer:
     config: TrainerConfig = registered_methods()[method].specification.config
-    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=16)
+    settings: dict[str, Any] = {"schedule": schedule}
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
+    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=16, pixel_sampler=sampler)
     pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(width=16, depth=2))
     machine = replace(config.machine, seed=seed)
     config = replace(config, pipeline=pipeline, max_num_iterations=400, machine=machine, revive=revive)
@@ -157,3 +162,28 @@ def test_the_probe_sees_every_image(tmp_path: Path) -> None:
     again = trainer_of(tmp_path).revival
     assert again is not None
     torch.testing.assert_close(again.probe.origins, trainer.revival.probe.origins)
+
+
+@pytest.mark.parametrize("saved_after", [10, 30, 40])
+def test_a_checkpoint_remembers_what_auto_has_seen(
+    saved_after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Saved in the early phase, in the late one, and in the early one that follows: all three are forced."""
+    monkeypatch.setattr(schedule, "PAYS_NO_MORE", float("inf"))
+    monkeypatch.setattr(schedule, "LEARNT", 1e6)
+    monkeypatch.setattr(schedule, "LOST", 0.0)
+    trainer = trainer_of(tmp_path, "edge-se-nerf", schedule="auto")
+    sampler: Any = trainer.pipeline.datamanager.train_pixel_sampler
+    for step in range(saved_after):
+        trainer.train_iteration(step)
+        trainer.next_step = step + 1
+    expected = {10: "edge", 30: "se", 40: "edge"}[saved_after]
+    assert sampler.strategy == expected
+    trainer.save()
+    went_on = [(trainer.train_iteration(step), sampler.strategy) for step in range(saved_after, saved_after + 30)]
+    assert len({strategy for _, strategy in went_on}) == 2
+
+    resumed = trainer.config.setup(run=trainer.run, pipeline=Pipeline.build(trainer.config, VIEWS, "cpu"), preview=None)
+    resumed.resume()
+    again: Any = resumed.pipeline.datamanager.train_pixel_sampler
+    assert [(resumed.train_iteration(step), again.strategy) for step in range(saved_after, saved_after + 30)] == went_on

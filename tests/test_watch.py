@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,10 @@ import pytest
 import torch
 from batches import batch_of, following
 
+from edge_se_sampler.bench.paper.cell import PRESETS
+from edge_se_sampler.bench.paper.scenes import made_scenes
+from edge_se_sampler.bench.schedule.cell import Cell, settings_of
+from edge_se_sampler.bench.trial import trial
 from edge_se_sampler.distribution import PixelTable, UniformPixels
 from edge_se_sampler.image_batch import ImageBatch
 from edge_se_sampler.plain_background import PlainBackgrounds, summed_up
@@ -247,3 +253,56 @@ def test_other_schedules_watch_nothing() -> None:
     assert sampler.watch is None
     assert sampler.trained_on is None
     assert sampler.strategy == "se"
+
+
+# -- negative controls: schedules that do not watch
+
+
+class Stuck(Watch):
+    """Never leaves its early phase."""
+
+    def observe(self, count: float, edge_error: float, edge_background: float, uniform_error: float) -> None:
+        super().observe(count, edge_error, edge_background, uniform_error)
+        self.phase = "early"
+
+
+class Hasty(Watch):
+    """Leaves at once."""
+
+    def observe(self, count: float, edge_error: float, edge_background: float, uniform_error: float) -> None:
+        super().observe(count, edge_error, edge_background, uniform_error)
+        self.phase = "late"
+
+
+def watches(kind: type[Watch]) -> bool:
+    """Whether it leaves when the object is learnt, stays while it is not, and comes back when it is lost."""
+    learnt, never, lost = kind(), kind(), kind()
+    return (
+        phases(LEARNING, watch=learnt)[-1] == "late"
+        and set(phases(np.full(300, 0.95), watch=never)) == {"early"}
+        and phases(np.concatenate((np.full(100, 0.2), np.full(100, 1.0))), watch=lost)[-1] == "early"
+    )
+
+
+def test_schedules_that_do_not_watch_are_caught() -> None:
+    assert watches(Watch)
+    assert not watches(Stuck)
+    assert not watches(Hasty)
+
+
+@pytest.mark.slow
+def test_staying_and_leaving_at_once_cost_what_auto_saves(tmp_path: Path) -> None:
+    """300 steps. Off centre a run without an early phase dies; centred, one without a late phase leaves a fog."""
+
+    def trained(table: int, scene: str, **settings: Any) -> dict[str, Any]:
+        cell = Cell("lengths", table, scene, 300, "auto", 100)
+        config = settings_of(cell, made_scenes(PRESETS["cpu"], [cell], tmp_path)(cell), tmp_path / "runs")
+        manager = config.pipeline.datamanager
+        manager = replace(manager, pixel_sampler=replace(manager.pixel_sampler, **settings))
+        return trial(replace(config, pipeline=replace(config.pipeline, datamanager=manager)), threads=1)
+
+    at_once = {"schedule": "fraction", "early_fraction": 0.0}
+    for_ever = {"schedule": "fraction", "early_fraction": 1.0}
+    assert trained(2, "mic", **at_once)["outcome"] == "background"
+    assert trained(2, "mic")["outcome"] == "learnt"
+    assert trained(1, "drums")["psnr"] > trained(1, "drums", **for_ever)["psnr"] + 0.3
