@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -199,6 +200,17 @@ def test_a_killed_worker_costs_no_finished_cell(experiment: Any) -> None:
     assert result["errors"] == []
 
 
+def interrupts_itself() -> int:
+    os.kill(os.getpid(), signal.SIGINT)
+    return 7
+
+
+def test_ctrl_c_is_for_the_one_that_gives_out_the_work() -> None:
+    """It reaches every process of the terminal; a worker that answered it would print a traceback."""
+    with running.executor_of(1, None)() as executor:
+        assert executor.submit(interrupts_itself).result() == 7
+
+
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"version": 0, "settings": {}, "runs": []}'])
 def test_another_result_is_neither_continued_nor_overwritten(content: str, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
@@ -238,7 +250,8 @@ def test_the_command_runs_a_subset(tmp_path: Path, edge_se: Any, monkeypatch: py
     assert 'src="http' not in page
     assert "href" not in page  # stands alone
     result = json.loads((out / "result.json").read_text())
-    assert [claim["verdict"] for claim in result["verdicts"]] == ["undecided"] * 3
+    told = [claim["verdict"] for claim in result["verdicts"]]
+    assert told == ["nothing to compare", "undecided", "nothing to compare"]  # after four steps all have failed
 
 
 def test_a_dry_run_trains_and_writes_nothing(tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,6 +271,23 @@ def test_an_estimate_follows_what_a_step_costs(monkeypatch: pytest.MonkeyPatch) 
     for strategy, table, hours in (("edge-nerf", 1, 4), ("edge-se-nerf", 1, 6.4), ("edge-se-nerf", 3, 3.9)):
         plan = estimate.plan_of([Cell(table, "mic", strategy, 0)], 0, SMALL, 1)
         assert f"{hours:.1f} hours" in plan, plan
+
+
+def test_the_papers_preset_trains_on_real_folders(
+    tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PRESETS, "paper", replace(SMALL, image_size=None))
+    monkeypatch.setattr(running, "executor_of", lambda *_: lambda: ThreadPoolExecutor(1))
+    (made,) = make_scenes(tmp_path / "made", ["bricks"], size=20, num_train=3, num_val=0, num_test=1)
+    made.rename(tmp_path / "made" / "lego")
+    flags = ["--preset", "paper", "--data", tmp_path / "made", "--workplace", tmp_path / "w", "--seeds", 0]
+    which = ["--tables", 1, 2, "--scenes", "bricks", "--strategies", "edge-nerf"]
+    answer = edge_se("bench", "paper", "--output-dir", tmp_path / "o", *flags, *which)
+    assert answer.code == 0, answer
+    runs = json.loads((tmp_path / "o" / "result.json").read_text())["runs"]
+    assert [(run["table"], run["placement"]) for run in runs] == [(1, "centered"), (2, "shifted")]
+    views = [iio.imread(path).shape for path in sorted((tmp_path / "o" / "views").iterdir())]
+    assert views == [(20, 20, 3), (26, 28, 3)]
 
 
 def test_real_data_and_its_counterparts(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -37,7 +38,8 @@ def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
     """
     if scheduler is None:
         spawn = multiprocessing.get_context("spawn")  # a forked torch may hang
-        return lambda: ProcessPoolExecutor(workers, mp_context=spawn)
+        ignored = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; this process tells the others
+        return lambda: ProcessPoolExecutor(workers, spawn, signal.signal, ignored)
     try:
         from distributed import Client  # pyright: ignore[reportMissingImports]
     except ImportError:
