@@ -82,6 +82,24 @@ def test_the_readme_quotes_the_papers_tables():
         assert f"| {label} | " + " | ".join(fields) + " |" in (ROOT / "README.md").read_text()
 
 
+@pytest.mark.parametrize(
+    ("label", "tables"),
+    [
+        ("nothing: Xavier weights, ReLU", (1, 2)),
+        ("softplus density", (14, 15)),
+        ("torch's initial weights", (7, 8)),
+        ("torch's initial weights, `--revive True`", (17, 18)),
+    ],
+)
+def test_the_readme_quotes_what_helps_random(label: str, tables: tuple[int, int]):
+    told = []
+    for table in tables:
+        of_random = [run for run in result("paper/cpu/result.json")["runs"] if run["strategy"] == "vanilla-nerf"]
+        runs = [run for run in of_random if run["table"] == table]
+        told.append(f"{sum(map(failed, runs))} of {len(runs)} failed")
+    assert f"| {label} | " + " | ".join(told) + " |" in (ROOT / "README.md").read_text()
+
+
 def test_the_verdicts_are_what_the_committed_runs_say():
     told = result("paper/cpu/result.json")
     assert told["verdicts"] == json.loads(json.dumps(verdicts(told["runs"])))
