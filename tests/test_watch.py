@@ -90,8 +90,8 @@ def test_the_rarer_the_object_the_longer_the_window() -> None:
 
 def test_a_fog_is_not_an_object() -> None:
     """A grey fog is nearer to a dark object than the white behind it, but hides the white as well."""
-    error, distance = torch.tensor([0.5] * 10 + [0.7] * 30), torch.tensor([2.0] * 10 + [0.0] * 30)
-    said = summed_up(error, distance, torch.ones(40), True)
+    error, distance = np.array([0.5] * 10 + [0.7] * 30), np.array([2.0] * 10 + [0.0] * 30)
+    said = summed_up(error, distance, np.ones(40), True)
     assert error[:10].mean() < 0.5 * distance[:10].mean()
     watch = Watch()
     for _ in range(500):
@@ -126,12 +126,12 @@ def test_it_goes_on_from_a_state() -> None:
 
 
 def test_distance_from_the_background_with_alpha() -> None:
-    image = torch.tensor([[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.5], [0.3, 0.4, 0.5, 0.0]])
-    pixels = {"indices": torch.zeros((3, 3), dtype=torch.int64), "image": image}
-    found = PlainBackgrounds().squared_distance(pixels, (1.0, 1.0, 1.0))
-    torch.testing.assert_close(found, torch.tensor([2.0, 0.5, 0.0]))
-    found = PlainBackgrounds().squared_distance(pixels, (0.0, 0.0, 0.0))
-    torch.testing.assert_close(found, torch.tensor([1.0, 0.25, 0.0]))
+    image = np.array([[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.5], [0.3, 0.4, 0.5, 0.0]], dtype=np.float32)
+    numbers = np.zeros(3, dtype=np.int64)
+    found = PlainBackgrounds().squared_distance(image, numbers, (1.0, 1.0, 1.0))
+    np.testing.assert_allclose(found, [2.0, 0.5, 0.0])
+    found = PlainBackgrounds().squared_distance(image, numbers, (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(found, [1.0, 0.25, 0.0])
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -145,17 +145,15 @@ def test_without_alpha_the_border_tells_the_background(dtype: torch.dtype) -> No
     backgrounds = PlainBackgrounds()
     backgrounds.look_at(ImageBatch.of(batch, use_mask=False))
     backgrounds.look_at(ImageBatch.of(batch, use_mask=False))
-    numbers = batch["image_idx"]
     for row, expected in ((0, 0.0), (3, 1.0)):
-        indices = torch.stack((numbers, torch.full((3,), row), torch.full((3,), 3)), dim=1)
-        pixels = {"indices": indices, "image": torch.stack([image[row, 3] for image in batch["image"]])}
-        distance = backgrounds.squared_distance(pixels, (1.0, 1.0, 1.0))
-        torch.testing.assert_close(distance, expected * colors.square().sum(dim=1))
+        pixels = torch.stack([image[row, 3] for image in batch["image"]]).numpy()
+        distance = backgrounds.squared_distance(pixels, batch["image_idx"].numpy(), (1.0, 1.0, 1.0))
+        np.testing.assert_allclose(distance, (expected * colors.square().sum(dim=1)).numpy(), atol=1e-6)
 
 
 def test_a_step_summed_up() -> None:
-    error, distance = torch.tensor([0.5, 9.0, 0.1, 0.4]), torch.tensor([1.0, 0.0, 0.5, 0.009])
-    relative = torch.tensor([4.0, 0.5, 2.0, 1.0])
+    error, distance = np.array([0.5, 9.0, 0.1, 0.4]), np.array([1.0, 0.0, 0.5, 0.009])
+    relative = np.array([4.0, 0.5, 2.0, 1.0])
     assert summed_up(error, distance, relative, False) == (
         2,
         pytest.approx((2 + 4.5 + 0.2 + 0.4) / 4),
@@ -182,8 +180,8 @@ def test_both_ways_of_drawing_tell_the_same() -> None:
     for source, by_edge in ((table, True), (UniformPixels([(40, 30)]), False)):
         drawn = source.draw(torch.tensor([0]), 100_000, np.random.default_rng(1))
         at = (drawn[:, 1].numpy(), drawn[:, 2].numpy())
-        relative = table.relative(torch.tensor([0]), drawn)
-        _, *said = summed_up(torch.from_numpy(error[at]), torch.from_numpy(distance[at]), relative, by_edge)
+        relative = table.relative(torch.tensor([0]), drawn).numpy()
+        _, *said = summed_up(error[at], distance[at], relative, by_edge)
         assert said == pytest.approx(truth, rel=0.02), by_edge
 
 

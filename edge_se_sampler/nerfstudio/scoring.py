@@ -71,7 +71,7 @@ def watch_training(model: nn.Module, sampler: ImportantPixels) -> None:
             return
         with torch.no_grad():
             errors = squared_errors(module, outputs, batch["image"])
-        if len(errors) == len(batch["indices"]):
+        if len(errors) == len(batch["image"]):
             sampler.observe(errors)
             _warn_of_the_dead(sampler.watch)
 

@@ -69,8 +69,9 @@ def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
     observe, share = sampler.observe, 1.0
 
     def as_if(errors: torch.Tensor) -> None:
-        distance = sampler._backgrounds.squared_distance(sampler.trained_on, sampler.background)
-        observe(torch.full_like(distance, share * float(distance.mean())))  # alike, so that edges do not pay
+        image, numbers = (sampler.trained_on[key].numpy() for key in ("image", "numbers"))
+        distance = sampler._backgrounds.squared_distance(image, numbers, sampler.background)
+        observe(torch.full((len(image),), share * float(distance.mean())))  # alike, so that edges do not pay
 
     sampler.observe = as_if
     seen = watch(sampler)
