@@ -6,6 +6,9 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -209,6 +212,35 @@ def test_ctrl_c_is_for_the_one_that_gives_out_the_work() -> None:
     """It reaches every process of the terminal; a worker that answered it would print a traceback."""
     with running.executor_of(1, None)() as executor:
         assert executor.submit(interrupts_itself).result() == 7
+
+
+GIVES_OUT_WORK = """
+import os, time
+from edge_se_sampler.bench.experiment import executor_of
+if __name__ == "__main__":
+    executor = executor_of(1, None)()
+    print(executor.submit(os.getpid).result(), flush=True)
+    time.sleep(60)
+"""
+
+
+def test_workers_do_not_outlive_the_one_that_gave_out_the_work(tmp_path: Path) -> None:
+    (tmp_path / "gives_out_work.py").write_text(GIVES_OUT_WORK)
+    command = [sys.executable, tmp_path / "gives_out_work.py"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        worker = int(process.stdout.readline())
+        os.kill(worker, 0)
+        process.kill()
+    for _ in range(100):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        if Path(f"/proc/{worker}/stat").exists() and ") Z " in Path(f"/proc/{worker}/stat").read_text():
+            return  # dead, and its new parent has not looked yet
+        time.sleep(0.1)
+    raise AssertionError(f"worker {worker} is still there")
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"version": 0, "settings": {}, "runs": []}'])

@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -38,8 +39,7 @@ def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
     """
     if scheduler is None:
         spawn = multiprocessing.get_context("spawn")  # a forked torch may hang
-        ignored = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; this process tells the others
-        return lambda: ProcessPoolExecutor(workers, spawn, signal.signal, ignored)
+        return lambda: ProcessPoolExecutor(workers, spawn, _begin_worker)
     try:
         from distributed import Client  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -49,6 +49,15 @@ def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
     except (OSError, ValueError) as problem:
         raise InputError(f"--scheduler {scheduler}: no dask scheduler answers there ({problem})") from problem
     return client.get_executor
+
+
+def _begin_worker() -> None:
+    """Ctrl-C reaches every process of a terminal: the one that gives out the work answers it. Should that one be
+    killed, its workers end too instead of waiting for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def default_workers() -> int:

@@ -153,4 +153,4 @@ def test_a_model_without_colours_is_refused() -> None:
             return {"depth": rays}
 
     with pytest.raises(InputError, match="Depth renders neither rgb nor rgb_fine"):
-        scoring.ray_errors(Depth(), torch.zeros(3), {})
+        scoring.ray_errors(Depth(), torch.zeros(3), {"image": torch.zeros((3, 3))})
