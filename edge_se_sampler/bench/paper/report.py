@@ -31,6 +31,7 @@ caption { text-align: left; font-weight: 600; padding: .8rem 0 .3rem; white-spac
 td small { display: block; color: var(--dim) } .failed { color: var(--bad) }
 details { border: 1px solid var(--line); border-radius: .5rem; padding: .5rem .8rem; margin: .5rem 0 }
 summary { cursor: pointer } summary b { float: right; margin-left: 1rem }
+summary::after { content: ""; display: block; clear: both }
 .supported { color: var(--good) } .not-supported { color: var(--bad) } .undecided { color: var(--open) }
 figure { margin: 1rem 0 }
 figure img { width: 100%; min-width: 42rem; height: auto; background: white; border-radius: .4rem }
