@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from batches import batch_of, following
-from tiny import tiny_views
+from tiny import tiny_model, tiny_rays, tiny_views
 from torch import Tensor
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
@@ -73,3 +73,35 @@ def test_another_sampler_is_left_alone() -> None:
     )
     manager.train_pixel_sampler = Other(config)
     assert manager.get_training_callbacks(attributes(planned=300, seed=5)) == []
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_coarse_errors_are_those_of_the_whole_rendering(training: bool) -> None:
+    model = tiny_model().train(training)
+    rays, image = tiny_rays(9), torch.rand((9, 4), dtype=torch.float64)
+    model.begin_step(0, 3)
+    whole = model.squared_error(model(rays), image, "coarse")
+    model.begin_step(0, 3)
+    torch.testing.assert_close(model.coarse_squared_error(rays, image), whole, rtol=0, atol=0)
+
+
+def test_coarse_scoring_never_asks_the_fine_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    def manager_of(how: Any) -> Any:
+        config = EdgeSEPixelSamplerConfig(se_scoring=how)
+        return VanillaDataManagerConfig(train_num_rays_per_batch=64, pixel_sampler=config).setup(
+            views=tiny_views(3, 9, 14)
+        )
+
+    model = tiny_model().float()
+    batch = {"image": torch.rand((9, 4))}
+    rays = tiny_rays(9, dtype=torch.float32)
+    exact = manager_of("exact").ray_errors(model, rays, batch)
+    assert not torch.equal(exact, manager_of("coarse").ray_errors(model, rays, batch))
+
+    def asked(*_: Any) -> None:
+        raise AssertionError("the fine network")
+
+    monkeypatch.setattr(model.fine, "forward", asked)
+    assert manager_of("coarse").ray_errors(model, rays, batch).shape == (9,)
+    with pytest.raises(AssertionError, match="the fine network"):
+        manager_of("exact").ray_errors(model, rays, batch)

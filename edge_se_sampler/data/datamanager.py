@@ -16,6 +16,7 @@ from edge_se_sampler.datamanager import scoring
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.pixel_sampler import ImportantPixels
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from edge_se_sampler.sampling_settings import SamplingSettings
 
 
 class VanillaDataManager:
@@ -91,10 +92,13 @@ class VanillaDataManager:
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
 
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
-        """(n,) squared errors of the model's fine colours, in training mode."""
+        """(n,) squared errors of the model's fine colours, or of its coarse ones if so configured, in training mode."""
         image = unit_interval(batch["image"]).to(self.device)
-        parts = [model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in model.chunks(len(ray_bundle))]
-        return torch.cat(parts)
+        chunks = list(model.chunks(len(ray_bundle)))
+        settings = self.train_pixel_sampler.config
+        if isinstance(settings, SamplingSettings) and settings.se_scoring == "coarse":
+            return torch.cat([model.coarse_squared_error(ray_bundle[rows], image[rows]) for rows in chunks])
+        return torch.cat([model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in chunks])
 
 
 def unit_interval(image: Tensor) -> Tensor:

@@ -64,13 +64,7 @@ class NeRFModel(nn.Module):
             world units along the ray; background (n, 3) behind each ray; density_fine, delta_fine (n, s) of the
             fine network's samples.
         """
-        config, count = self.config, len(rays)
-        samples = config.num_coarse_samples or 0
-        norm = rays.metadata["directions_norm"]
-        jitter = self._uniform(count, samples) if self.training else None
-        t = stratified(config.near * norm, config.far * norm, samples, jitter)
-        background = self._background(count) if self.background is None else self.background(rays)
-        weights, rgb, _ = self._render(self.coarse, rays, t, background)
+        t, weights, rgb, background = self._coarse(rays)
         outputs = {"rgb_coarse": rgb, "accumulation_coarse": weights.sum(1, keepdim=True), "background": background}
 
         t = torch.sort(torch.cat((t, self._importance(t, weights.detach())), dim=1)).values
@@ -79,6 +73,11 @@ class NeRFModel(nn.Module):
         depth = (weights * t).sum(1, keepdim=True) + (1 - accumulation) * t[:, -1:]
         fine = {"rgb_fine": rgb, "accumulation_fine": accumulation, "depth_fine": depth}
         return outputs | fine | dict(zip(("density_fine", "delta_fine"), samples, strict=True))
+
+    def coarse_squared_error(self, rays: RayBundle, image: Tensor) -> Tensor:
+        """(n,) `squared_error` of the coarse colours, without asking the fine network."""
+        _, _, rgb, background = self._coarse(rays)
+        return self.squared_error({"rgb_coarse": rgb, "background": background}, image, "coarse")
 
     def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
         """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.
@@ -98,6 +97,17 @@ class NeRFModel(nn.Module):
         image = batch["image"]
         error = self.squared_error(outputs, image, "coarse") + self.squared_error(outputs, image, "fine")
         return error * batch["weight"] / 3 if "weight" in batch else error / 3
+
+    def _coarse(self, rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of the coarse network: t and weights of its samples (n, s), colours, and backgrounds (n, 3)."""
+        config, count = self.config, len(rays)
+        samples = config.num_coarse_samples or 0
+        norm = rays.metadata["directions_norm"]
+        jitter = self._uniform(count, samples) if self.training else None
+        t = stratified(config.near * norm, config.far * norm, samples, jitter)
+        background = self._background(count) if self.background is None else self.background(rays)
+        weights, rgb, _ = self._render(self.coarse, rays, t, background)
+        return t, weights, rgb, background
 
     def _importance(self, t: Tensor, weights: Tensor) -> Tensor:
         count = self.config.num_importance_samples or 0

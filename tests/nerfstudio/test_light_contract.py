@@ -314,6 +314,11 @@ def test_loss_weights_are_refused_because_the_host_would_ignore_them() -> None:
         EdgeSEPixelSamplerConfig(importance_weight=1.0).setup(num_rays_per_batch=RAYS)
 
 
+def test_coarse_scoring_is_refused_because_the_host_renders_both() -> None:
+    with pytest.raises(InputError, match=r"se-scoring is 'coarse'.*only together with the fine ones"):
+        EdgeSEPixelSamplerConfig(se_scoring="coarse").setup(num_rays_per_batch=RAYS)
+
+
 def test_a_setting_without_meaning_is_refused_as_everywhere() -> None:
     with pytest.raises(InputError, match="edge-epsilon"):
         EdgeSEPixelSamplerConfig(edge_epsilon=0.0).setup(num_rays_per_batch=RAYS)
