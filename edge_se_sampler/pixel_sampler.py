@@ -179,7 +179,7 @@ class ImportantPixels:
         else:
             drawn, weight = self._draw(batch, strategy, count)
             pixels = batch.gather(drawn)
-            self._watch(batch, drawn, pixels)
+            self._await_errors(batch, drawn, pixels)
             if weight is not None:
                 pixels["weight"] = weight
         if self.config.keep_full_image:
@@ -233,7 +233,7 @@ class ImportantPixels:
             raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
         return source, places, drawable
 
-    def _watch(self, batch: ImageBatch, drawn: Tensor, pixels: dict[str, Any]) -> None:
+    def _await_errors(self, batch: ImageBatch, drawn: Tensor, pixels: dict[str, Any]) -> None:
         """Under "auto", keep what `observe` will need of drawn pixels."""
         if self.watch is not None:
             self._backgrounds.look_at(batch)
@@ -252,7 +252,7 @@ class ImportantPixels:
             errors = self._squared_error(candidates)
         if errors.shape != (len(drawn),):
             raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
-        self._watch(batch, drawn, candidates)
+        self._await_errors(batch, drawn, candidates)
         self.observe(errors)
         kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION, self._rank))
         pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
