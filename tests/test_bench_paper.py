@@ -127,7 +127,7 @@ def experiment(tmp_path: Path) -> Callable[..., dict[str, Any]]:
         result = running.begun(out / "result.json", SMALL)
         running.run_cells(
             todo, result, out / "result.json", executor, train,
-            lambda cell: (SMALL, data_of(cell), tmp_path / "w" / "runs", 1),
+            lambda cell: (SMALL, data_of(cell), tmp_path / "w" / "runs"),
             lambda cell, run: keep_view(out, cell, run),
         )  # fmt: skip
         return result
@@ -165,9 +165,9 @@ def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path) ->
 
 def test_a_cell_gives_the_same_result_alone_and_in_another_process(tmp_path: Path) -> None:
     data_of = made_scenes(SMALL, TWO_CELLS[:1], tmp_path)
-    own = run_cell(TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "a", 1)
+    own = run_cell(TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "a")
     with running.executor_of(1, None)() as executor:
-        other = executor.submit(run_cell, TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "b", 1).result()
+        other = executor.submit(run_cell, TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "b").result()
     for key in ("psnr", "loss", "foreground_share"):
         assert own[key] == other[key], key
 
@@ -188,7 +188,7 @@ def test_a_failing_cell_is_told_and_stops_no_other(experiment: Any) -> None:
     assert len(experiment(TWO_CELLS)["runs"]) == 2  # the next call tries it again
 
 
-def dies_once(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads: int) -> dict[str, Any]:
+def dies_once(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> dict[str, Any]:
     """Kills its process the first time."""
     mark = output_dir.parent / f"died-{cell.name}"
     if cell.table == 1 and not mark.exists():

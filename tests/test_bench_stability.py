@@ -130,7 +130,7 @@ def test_an_empty_network_is_told_dead_or_killed_by_how_it_began(tmp_path: Path)
     dead = dead_networks(model, [picture.rays(model.device) for picture in pictures])
     assert dead == ["coarse", "fine"]
     for level in ("coarse", "fine"):
-        shown = measured(model, pictures, level)
+        shown = measured(model, pictures)[level]
         assert shown.share == pytest.approx(1)
         assert shown.psnr == pytest.approx(shown.background_psnr)
         assert shown.accumulation == 0
@@ -142,7 +142,7 @@ def test_an_opaque_white_network_is_no_living_one(tmp_path: Path) -> None:
     """Its accumulation is that of an object everywhere, its gradient is alive: opacity tells nothing."""
     model, pictures = built("opaque white", tmp_path)
     assert dead_networks(model, [picture.rays(model.device) for picture in pictures]) == []
-    shown = measured(model, pictures, "fine")
+    shown = measured(model, pictures)["fine"]
     assert shown.accumulation > 0.99
     assert ending(shown, False) == "opaque background"
 
@@ -151,7 +151,7 @@ def test_a_perfect_network_has_learnt(tmp_path: Path, monkeypatch: pytest.Monkey
     trainer, pictures = trainer_of(BASE, "vanilla-nerf", 0, SMALL, tmp_path)
     model = trainer.pipeline.model
     monkeypatch.setattr(model, "squared_error", lambda outputs, image, level: torch.full((len(image),), 1e-4))
-    shown = measured(model, pictures, "coarse")
+    shown = measured(model, pictures)["coarse"]
     assert shown.share < 0.01
     assert shown.psnr == pytest.approx(-10 * np.log10(1e-4 / 3))
     assert ending(shown, False) == "learnt"

@@ -170,7 +170,7 @@ def test_a_random_background_is_behind_prediction_and_target_alike() -> None:
     assert torch.equal(outputs["rgb_fine"], behind)
     image = pixels()
     image[:, 3] = 0
-    assert not model.loss(outputs, {"image": image}).any()
+    assert not model.loss(outputs, {"image": image})[0].any()
     image[:, 3] = 1
     torch.testing.assert_close(model.squared_error(outputs, image), (behind - image[:, :3]).square().sum(1))
     assert bool((rendered(model.eval())["background"] == 1).all())
@@ -218,8 +218,10 @@ def test_the_loss_is_coarse_and_fine_error_a_mean_over_channels() -> None:
     fine = torch.tensor([0.09 + 0.01 + 0.01, 1.0])
     torch.testing.assert_close(model.squared_error(outputs, batch["image"]), fine)
     torch.testing.assert_close(model.squared_error(outputs, batch["image"], "coarse"), coarse)
-    torch.testing.assert_close(model.loss(outputs, batch), (coarse + fine) / 3)
-    weighted = model.loss(outputs, batch | {"weight": torch.tensor([2.0, 0.0])})
+    loss, fine_error = model.loss(outputs, batch)
+    torch.testing.assert_close(loss, (coarse + fine) / 3)
+    torch.testing.assert_close(fine_error, fine)
+    weighted, _ = model.loss(outputs, batch | {"weight": torch.tensor([2.0, 0.0])})
     torch.testing.assert_close(weighted, torch.tensor([2.0, 0.0]) * (coarse + fine) / 3)
 
 
@@ -242,7 +244,7 @@ def test_gradients_of_every_layer_against_finite_differences(occupied: Any) -> N
     batch = {"image": pixels(), "weight": torch.linspace(0.5, 2, RAYS, dtype=torch.float64)}
 
     def loss() -> Tensor:
-        return model.loss(rendered(model), batch).sum()
+        return model.loss(rendered(model), batch)[0].sum()
 
     loss().backward()
     rng = np.random.default_rng(0)
@@ -300,7 +302,7 @@ def test_culled_rendering_equals_dense_rendering_of_zeros(training: bool, activa
     losses, outputs = [], []
     for model in (packed, dense):
         outputs.append(rendered(model))
-        losses.append(model.loss(outputs[-1], batch).sum())
+        losses.append(model.loss(outputs[-1], batch)[0].sum())
         losses[-1].backward()
     for key in OUTPUTS:
         torch.testing.assert_close(outputs[0][key], outputs[1][key], rtol=0, atol=1e-12)
@@ -332,5 +334,5 @@ def test_where_nothing_is_occupied_the_background_stays_and_nothing_is_learnt() 
     model.occupied = lambda positions: torch.zeros(len(positions), dtype=torch.bool)
     outputs = rendered(model)
     assert bool((outputs["rgb_fine"] == 1).all())
-    model.loss(outputs, {"image": pixels()}).sum().backward()
+    model.loss(outputs, {"image": pixels()})[0].sum().backward()
     assert all(parameter.grad is None or not parameter.grad.any() for parameter in model.parameters())

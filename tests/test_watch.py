@@ -297,7 +297,7 @@ def test_staying_and_leaving_at_once_cost_what_auto_saves(tmp_path: Path) -> Non
         config = settings_of(cell, made_scenes(PRESETS["cpu"], [cell], tmp_path)(cell), tmp_path / "runs")
         manager = config.pipeline.datamanager
         manager = replace(manager, pixel_sampler=replace(manager.pixel_sampler, **settings))
-        return trial(replace(config, pipeline=replace(config.pipeline, datamanager=manager)), threads=1)
+        return trial(replace(config, pipeline=replace(config.pipeline, datamanager=manager)))
 
     at_once = {"schedule": "fraction", "early_fraction": 0.0}
     for_ever = {"schedule": "fraction", "early_fraction": 1.0}

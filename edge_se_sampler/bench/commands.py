@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -99,8 +100,33 @@ class BenchNerfstudio:
             )
 
 
-@dataclass(frozen=True)
-class BenchPaper:
+@dataclass(frozen=True, kw_only=True)
+class _Parallel:
+    """What benches of many trainings have in common."""
+
+    workers: int | None = None
+    """Trainings at once, a thread each; left out, as many as there are cores, or one where there is a GPU."""
+    scheduler: str | None = None
+    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers."""
+
+    def processes(self) -> int:
+        """--workers, checked."""
+        from edge_se_sampler.bench.experiment import default_workers
+
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--workers is {self.workers}: give at least one")
+        return self.workers or default_workers()
+
+
+def _check_known(flag: str, chosen: Sequence[object], known: Iterable[object]) -> None:
+    known = tuple(known)
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchPaper(_Parallel):
     """Remake the paper's tables and figures, and judge its claims; leave result.json, tables.md, pictures and
     report.html. Goes on where it was ended."""
 
@@ -120,15 +146,11 @@ class BenchPaper:
     """Of the paper's six, under the methods' names; none: all."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of weights, pixels and jitter."""
-    workers: int | None = None
-    """Cells trained at once, a thread each; left out, as many as there are cores, or one where there is a GPU."""
-    scheduler: str | None = None
-    """Address of a dask scheduler whose workers take the cells ([cluster] extra), instead of --workers."""
     dry_run: tyro.conf.UseCounterAction[int] = 0
     """Only tell which cells there are and how long they will take; trains nothing, writes nothing."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, default_workers, executor_of, missing, run_cells
+        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
         from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells, run_cell
         from edge_se_sampler.bench.paper.estimate import plan_of
         from edge_se_sampler.bench.paper.outputs import keep_view, write_outputs
@@ -137,21 +159,16 @@ class BenchPaper:
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
-        for flag, chosen, known in (
-            ("tables", self.tables, tuple(TABLES)),
-            ("scenes", self.scenes, SCENES),
-            ("strategies", self.strategies, STRATEGIES),
-        ):
-            for name in chosen:
-                if name not in known:
-                    raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
-        if not self.seeds or (self.workers is not None and self.workers < 1):
-            raise InputError("--seeds and --workers: at least one")
+        _check_known("tables", self.tables, TABLES)
+        _check_known("scenes", self.scenes, SCENES)
+        _check_known("strategies", self.strategies, STRATEGIES)
+        if not self.seeds:
+            raise InputError("--seeds: give at least one")
+        workers = self.processes()
         if (self.data is None) != (self.preset == "cpu"):
             raise InputError("--preset paper needs --data, a NeRF-synthetic folder; --preset cpu makes its scenes")
         preset = PRESETS[self.preset]
         todo = cells(self.tables, self.scenes, self.strategies, self.seeds)
-        workers = self.workers or default_workers()
         if self.data is not None:
             check_real(self.data, todo)
         path = self.output_dir / "result.json"
@@ -168,7 +185,7 @@ class BenchPaper:
             data_of = real_scenes(self.data, todo, self.workplace)
         run_cells(
             todo, result, path, new_executor, run_cell,
-            lambda cell: (preset, data_of(cell), self.workplace / "runs", 1),
+            lambda cell: (preset, data_of(cell), self.workplace / "runs"),
             lambda cell, run: keep_view(self.output_dir, cell, run),
         )  # fmt: skip
         write_outputs(result, data_of, self.output_dir)
@@ -177,8 +194,8 @@ class BenchPaper:
         print(f"{len(result['runs'])} cells; see {self.output_dir / 'report.html'}")
 
 
-@dataclass(frozen=True)
-class BenchStability:
+@dataclass(frozen=True, kw_only=True)
+class BenchStability(_Parallel):
     """Map where training dies, by strategy and setting; leave result.json, table.md and pictures. Goes on where it
     was ended."""
 
@@ -192,30 +209,22 @@ class BenchStability:
     """Of the paper's six, revived and auto; none: all."""
     seeds: tuple[int, ...] = tuple(range(10))
     """Of weights, pixels and jitter."""
-    workers: int | None = None
-    """Trainings at once, a thread each; left out, as many as there are cores."""
-    scheduler: str | None = None
-    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers."""
     dry_run: tyro.conf.UseCounterAction[int] = 0
     """Only tell which points there are, and how much is done; trains nothing, writes nothing."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, default_workers, executor_of, missing, run_cells
+        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
         from edge_se_sampler.bench.stability.point import STRATEGIES, cells, points
         from edge_se_sampler.bench.stability.summary import write_outputs
         from edge_se_sampler.bench.stability.train import Scale, run_cell
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
-        for flag, chosen, known in (
-            ("points", self.points, tuple(range(len(points())))),
-            ("strategies", self.strategies, tuple(STRATEGIES)),
-        ):
-            for name in chosen:
-                if name not in known:
-                    raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
-        if not self.seeds or (self.workers is not None and self.workers < 1):
-            raise InputError("--seeds and --workers: at least one")
+        _check_known("points", self.points, range(len(points())))
+        _check_known("strategies", self.strategies, STRATEGIES)
+        if not self.seeds:
+            raise InputError("--seeds: give at least one")
+        workers = self.processes()
         scale, path = Scale(), self.output_dir / "result.json"
         todo, result = cells(self.points, self.strategies, self.seeds), begun(path, scale)
         if self.dry_run:
@@ -224,7 +233,7 @@ class BenchStability:
             print(f"{len(todo)} trainings of {scale.iterations} steps, {len(missing(todo, result))} still to do")
             return
         require_pyplot()
-        new_executor = executor_of(self.workers or default_workers(), self.scheduler)
+        new_executor = executor_of(workers, self.scheduler)
         make_folder(self.output_dir, "--output-dir")
         views = (self.workplace / "stability").resolve()
         run_cells(todo, result, path, new_executor, run_cell, lambda _: (scale, views))
@@ -234,8 +243,8 @@ class BenchStability:
         print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
 
 
-@dataclass(frozen=True)
-class BenchSchedule:
+@dataclass(frozen=True, kw_only=True)
+class BenchSchedule(_Parallel):
     """Put schedule auto to the test: failures of 280 runs paired with Random's, and PSNR over planned lengths against
     fixed ones; leave result.json, table.md and lengths.png. Goes on where it was ended."""
 
@@ -249,13 +258,9 @@ class BenchSchedule:
     """Of the runs that may fail."""
     length_seeds: tuple[int, ...] = (0, 1, 2)
     """Of the runs over planned lengths; the fixed length is chosen on seeds 100 and 101."""
-    workers: int | None = None
-    """Trainings at once, a thread each; left out, as many as there are cores."""
-    scheduler: str | None = None
-    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, default_workers, executor_of, run_cells
+        from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
         from edge_se_sampler.bench.paper.cell import PRESETS
         from edge_se_sampler.bench.paper.scenes import made_scenes
         from edge_se_sampler.bench.schedule.cell import Scale, failure_cells, length_cells, run_cell
@@ -263,9 +268,9 @@ class BenchSchedule:
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
-        workers = default_workers() if self.workers is None else self.workers
-        if not (self.parts and self.failure_seeds and self.length_seeds and workers > 0):
-            raise InputError("--parts, --failure-seeds, --length-seeds and --workers: at least one")
+        if not (self.parts and self.failure_seeds and self.length_seeds):
+            raise InputError("--parts, --failure-seeds and --length-seeds: give at least one of each")
+        workers = self.processes()
         scale, path = Scale(), self.output_dir / "result.json"
         todo = failure_cells(scale, self.failure_seeds) if "failures" in self.parts else []
         todo += length_cells(self.length_seeds) if "lengths" in self.parts else []

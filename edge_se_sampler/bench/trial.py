@@ -20,15 +20,15 @@ from edge_se_sampler.engine.session import prepare, test_pictures
 MEASURES = ("psnr", "ssim", "foreground_psnr", "edge_band_psnr", "background_mse")
 
 
-def trial(config: TrainerConfig, threads: int) -> dict[str, Any]:
-    """Train a config and measure it on its held-out views.
+def trial(config: TrainerConfig) -> dict[str, Any]:
+    """Train a config, on one thread, and measure it on its held-out views.
 
     Returns:
         psnr and the other measures, outcome, which networks were dead before the first step and how many began anew,
         seconds, CPU seconds, steps, the training loss at every `loss_every`th step, and `view`, the first held-out
         view as PNG.
     """
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)  # there are as many trainings at once as cores
     with contextlib.redirect_stderr(io.StringIO()):  # its progress: several write to one terminal
         trainer = prepare(config)
         pictures, model = test_pictures(trainer.config), trainer.pipeline.model

@@ -90,8 +90,8 @@ class InfoNeRFModel(NeRFModel):
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """(n,) NeRF's loss and the information gain; and the squared errors."""
         outputs = self(rays)
-        loss = self.loss(outputs, batch) + self._gain(rays, outputs)
-        return loss, self.squared_error(outputs, batch["image"]).detach()
+        loss, error = self.loss(outputs, batch)
+        return loss + self._gain(rays, outputs), error
 
     def unseen_loss(self, rays: RayBundle) -> Tensor:
         """(n,) ray entropy and information gain."""

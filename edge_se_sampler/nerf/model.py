@@ -89,14 +89,14 @@ class NeRFModel(nn.Module):
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """(n,) what training minimises the mean of on a batch's rays, and (n,) the fine colours' squared errors."""
-        outputs = self(rays)
-        return self.loss(outputs, batch), self.squared_error(outputs, batch["image"]).detach()
+        return self.loss(self(rays), batch)
 
-    def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-        """(n,) coarse + fine error of every ray, a mean over channels as in NeRF's code, times its weight if any."""
-        image = batch["image"]
-        error = self.squared_error(outputs, image, "coarse") + self.squared_error(outputs, image, "fine")
-        return error * batch["weight"] / 3 if "weight" in batch else error / 3
+    def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """(n,) coarse + fine error of every ray, a mean over channels as in NeRF's code, times its weight if any; and
+        (n,) the fine squared error alone, without a gradient."""
+        fine = self.squared_error(outputs, batch["image"], "fine")
+        error = self.squared_error(outputs, batch["image"], "coarse") + fine
+        return (error * batch["weight"] / 3 if "weight" in batch else error / 3), fine.detach()
 
     def _coarse(self, rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of the coarse network: t and weights of its samples (n, s), colours, and backgrounds (n, 3)."""

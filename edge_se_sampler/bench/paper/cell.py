@@ -134,6 +134,12 @@ def cells(
     ]
 
 
+def iterations_of(cell: Cell, preset: Preset) -> int:
+    """The planned ones."""
+    table = TABLES[cell.table]
+    return round(table.steps * (preset.info_iterations if table.method == "info-nerf" else preset.iterations))
+
+
 def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> TrainerConfig:
     """What a cell trains: dense and faithful, nothing culled."""
     table = TABLES[cell.table]
@@ -147,7 +153,7 @@ def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> Train
         coarse, importance = preset.samples
         model = replace(model, num_coarse_samples=coarse, num_importance_samples=importance)
     model = replace(model, size=preset.size, **table.model)
-    iterations = round(table.steps * (preset.info_iterations if info else preset.iterations))
+    iterations = iterations_of(cell, preset)
     return replace(
         config,
         data=data,
@@ -164,12 +170,12 @@ def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> Train
     )
 
 
-def run_cell(cell: Cell, preset: Preset, data: Path, output_dir: Path, threads: int) -> dict[str, Any]:
+def run_cell(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> dict[str, Any]:
     """Train a cell and measure it; runs in a process of its own.
 
     Returns:
         its place, and what `trial` measures.
     """
     table = TABLES[cell.table]
-    measured = trial(config_of(cell, preset, data, output_dir), threads)
+    measured = trial(config_of(cell, preset, data, output_dir))
     return {**asdict(cell), "method": table.method, "placement": table.placement, **measured}

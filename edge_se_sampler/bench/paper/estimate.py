@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.paper.cell import LATE_SE, RANDOMS_TIME, TABLES, Cell, Preset, config_of
+from edge_se_sampler.bench.paper.cell import LATE_SE, RANDOMS_TIME, TABLES, Cell, Preset, config_of, iterations_of
 from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.engine.trainer import choose_device
 from edge_se_sampler.nerf.config import resolved
@@ -27,10 +27,10 @@ def plan_of(cells: list[Cell], done: int, preset: Preset, workers: int) -> str:
     total = 0.0
     for number in sorted({cell.table for cell in cells}):
         mine = [cell for cell in cells if cell.table == number]
-        cost = sum(_steps(cell, preset) * seconds[_kind(cell)] * _price(cell) for cell in mine)
+        cost = sum(iterations_of(cell, preset) * seconds[_kind(cell)] * _price(cell) for cell in mine)
         total += cost
         lines.append(
-            f"table {number:2}: {len(mine):4} cells of {_steps(mine[0], preset):,} steps, "
+            f"table {number:2}: {len(mine):4} cells of {iterations_of(mine[0], preset):,} steps, "
             f"{_duration(cost / workers):>12}  {TABLES[number].title}"
         )
     lines.append(
@@ -42,11 +42,6 @@ def plan_of(cells: list[Cell], done: int, preset: Preset, workers: int) -> str:
 
 def _kind(cell: Cell) -> str:
     return TABLES[cell.table].method
-
-
-def _steps(cell: Cell, preset: Preset) -> int:
-    table = TABLES[cell.table]
-    return round(table.steps * (preset.info_iterations if table.method == "info-nerf" else preset.iterations))
 
 
 def _price(cell: Cell) -> float:
@@ -71,7 +66,8 @@ def _step_seconds(method: str, preset: Preset) -> float:
     torch.set_num_threads(1)  # as a cell has
     for _ in range(5):
         began = time.perf_counter()
-        model.loss(model(rays), {"image": torch.zeros((tried, 3), device=device)}).mean().backward()
+        loss, _ = model.loss(model(rays), {"image": torch.zeros((tried, 3), device=device)})
+        loss.mean().backward()
         times.append(time.perf_counter() - began)
     torch.set_num_threads(threads)
     return min(times) * preset.rays / tried * (2 if method == "info-nerf" else 1)

@@ -25,8 +25,8 @@ from edge_se_sampler.show import require_pyplot, save_figure
 COLORS = {"vanilla-nerf": "#1f77b4", "precrop-nerf": "#ff7f0e", "edge-nerf": "#2ca02c"}
 """The paper's."""
 FAILED = "#d62728"
-CROP = 16
-"""A crop's side is the image's, divided by this and then times 5."""
+CROP = 5 / 16
+"""A crop's side, as a share of the image's."""
 
 
 @dataclass(frozen=True)
@@ -234,8 +234,8 @@ def _there(picture: np.ndarray | None) -> np.ndarray:
 
 
 def _busiest(image: np.ndarray) -> tuple[slice, slice]:
-    """The square with the most edge in it, a third of the image wide."""
-    side = 5 * min(image.shape[:2]) // CROP
+    """The square with the most edge in it, (rows, columns)."""
+    side = int(CROP * min(image.shape[:2]))
     total = cv2.boxFilter(edge_strength(image), -1, (side, side), anchor=(0, 0), normalize=False)
     total = total[: image.shape[0] - side + 1, : image.shape[1] - side + 1]
     top, left = (int(i) for i in np.unravel_index(total.argmax(), total.shape))

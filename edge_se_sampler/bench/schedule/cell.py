@@ -83,7 +83,7 @@ def settings_of(cell: Cell, data: Path, output_dir: Path) -> TrainerConfig:
 
 def run_cell(cell: Cell, data: Path, output_dir: Path) -> dict[str, Any]:
     """Train a cell and measure it; runs in a process of its own."""
-    measured = trial(settings_of(cell, data, output_dir), threads=1)
+    measured = trial(settings_of(cell, data, output_dir))
     for bulky in ("loss", "loss_every", "view"):
         del measured[bulky]
     return asdict(cell) | measured

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
+from edge_se_sampler.bench.outcome import outcome
 from edge_se_sampler.bench.stability.point import STRATEGIES, Cell, Point, points
 from edge_se_sampler.bench.stability.scene import COLORS, behind, views
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
@@ -62,14 +64,15 @@ class Measured:
 def ending(measured: Measured, dead_at_start: bool) -> Ending:
     """How a training ended.
 
-    Nothing learnt (share > 0.9): it began without a gradient, or is empty, or hides everything behind an opaque
-    background. Less than 0.5 dB better than the empty scene: slow.
+    As `outcome` has it; where nothing was learnt, it began without a gradient, or is empty, or hides everything
+    behind an opaque background.
     """
-    if measured.share > 0.9:
-        if dead_at_start:
-            return "dead at the start"
-        return "opaque background" if measured.accumulation > 0.5 else "killed by the data"
-    return "slow" if measured.psnr < measured.background_psnr + 0.5 else "learnt"
+    rough = outcome(measured.psnr, measured.background_psnr, measured.share)
+    if rough != "background":
+        return rough
+    if dead_at_start:
+        return "dead at the start"
+    return "opaque background" if measured.accumulation > 0.5 else "killed by the data"
 
 
 def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Path) -> tuple[Trainer, list[Picture]]:
@@ -123,11 +126,10 @@ def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
         for step in range(scale.iterations):
             trainer.train_iteration(step)
             if (step + 1) % max(1, scale.iterations // LOOKS) == 0:
-                shares.append(round(measured(model, pictures, "fine", stride=5).share, 4))
+                shares.append(round(measured(model, pictures, stride=5)["fine"].share, 4))
         revived = trainer.revival.used if trainer.revival is not None else 0
     told: dict[str, Any] = {}
-    for level in LEVELS:
-        shown = measured(model, pictures, level)
+    for level, shown in measured(model, pictures).items():
         told |= {f"{level}_ending": ending(shown, level in dead)}
         told |= {f"{level}_{key}": round(value, 4) for key, value in asdict(shown).items()}
     if told["fine_ending"] != "learnt":
@@ -146,24 +148,31 @@ def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def measured(model: NeRFModel, pictures: list[Picture], level: str, stride: int = 1) -> Measured:
-    """A network ("coarse" or "fine") against the held-out views, every stride-th pixel."""
+def measured(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict[str, Measured]:
+    """The coarse and the fine network against the held-out views, every stride-th pixel."""
     was_training = model.training
     model.eval()
-    errors, distances, accumulations, alphas = [], [], [], []
-    for picture in pictures:
+    images = [torch.from_numpy(picture.image).reshape(-1, 4)[::stride] for picture in pictures]
+    errors, accumulations = ({level: [] for level in LEVELS} for _ in range(2))
+    distances = []
+    for picture, image in zip(pictures, images, strict=True):
         rays = picture.rays(model.device)[::stride]
-        image = torch.from_numpy(picture.image).reshape(-1, 4)[::stride]
         for rows in model.chunks(len(rays)):
             outputs = model(rays[rows])
-            errors.append(model.squared_error(outputs, image[rows], level))
-            behind_it = outputs["background"]
-            distances.append((target_colors(image[rows], behind_it) - behind_it).square().sum(dim=1))
-            accumulations.append(outputs[f"accumulation_{level}"][:, 0])
-        alphas.append(image[:, 3])
+            away = target_colors(image[rows], outputs["background"]) - outputs["background"]
+            distances.append(away.square().sum(dim=1))
+            for level in LEVELS:
+                errors[level].append(model.squared_error(outputs, image[rows], level))
+                accumulations[level].append(outputs[f"accumulation_{level}"][:, 0])
     model.train(was_training)
-    error, distance, accumulation, alpha = map(torch.cat, (errors, distances, accumulations, alphas))
-    inside = alpha > 0
+    distance, inside = torch.cat(distances), torch.cat(images)[:, 3] > 0
+    return {
+        level: _measured(torch.cat(errors[level]), torch.cat(accumulations[level]), distance, inside)
+        for level in LEVELS
+    }
+
+
+def _measured(error: Tensor, accumulation: Tensor, distance: Tensor, inside: Tensor) -> Measured:
     return Measured(
         share=float(error[inside].sum() / distance[inside].sum()),
         psnr=psnr(float(error.mean() / 3)),
