@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -17,7 +18,7 @@ from edge_se_sampler.bench.stability import train as train_module
 from edge_se_sampler.bench.stability.point import AXES, BASE, PAIRS, STRATEGIES, Cell, Point, cells, points
 from edge_se_sampler.bench.stability.scene import SHIFT, behind, views
 from edge_se_sampler.bench.stability.summary import table, totals
-from edge_se_sampler.bench.stability.train import Measured, Scale, ending, measured, run_cell, trainer_of
+from edge_se_sampler.bench.stability.train import Measured, Scale, ending, measured, portrait, run_cell, trainer_of
 from edge_se_sampler.engine.revival import dead_networks
 from edge_se_sampler.nerf.model import NeRFModel
 
@@ -170,6 +171,9 @@ def test_a_point_is_trained_as_it_says(point: Point, tmp_path: Path) -> None:
     assert trainer.config.pipeline.model.density_noise == point.noise
     assert trainer.pipeline.datamanager.train_pixel_sampler.watch is not None
     assert trainer.revival is not None
+    for name, epsilon in (("auto", 0.01), ("auto-sharper", 0.001)):
+        sampler = trainer_of(point, name, 3, SMALL, tmp_path)[0].pipeline.datamanager.train_pixel_sampler
+        assert sampler.config.edge_epsilon == epsilon
     outputs = trainer.pipeline.model(pictures[0].rays(torch.device("cpu"))[:5])
     expected = behind(point.background)
     if expected is not None:
@@ -184,11 +188,33 @@ def test_a_run_tells_where_it_stands_and_how_it_ended(tmp_path: Path, monkeypatc
     assert first["initialization"] == "torch"
     assert first["outcome"] == first["fine_ending"] != "learnt"  # after four steps
     assert len(first["shares"]) == 4
-    assert [path.name for path in (tmp_path / "views").iterdir()] == [f"{Cell(number, 'vanilla-nerf', 5).name}.png"]
+    (view,) = (tmp_path / "views").iterdir()
+    assert view.name == f"{Cell(number, 'vanilla-nerf', 5).name}.png"
+    assert iio.imread(view).shape == (24, 3 * 24, 3)
     for run in (first, again):
         del run["cpu_seconds"]
     assert first == again
     assert json.loads(json.dumps(first)) == first
+
+
+@pytest.mark.parametrize(("density", "opaque"), [(-10.0, 0.0), (10.0, 1.0)])
+def test_a_portrait_shows_the_truth_the_rendering_and_the_opacity(
+    tmp_path: Path, density: float, opaque: float
+) -> None:
+    trainer, pictures = trainer_of(Point(background="green"), "vanilla-nerf", 1, SMALL, tmp_path)
+    model = trainer.pipeline.model
+    with torch.no_grad():
+        for field in (model.coarse, model.fine):
+            field.density.weight.zero_()
+            field.density.bias.fill_(density)
+    truth, rendering, opacity = np.split(portrait(model, pictures[0]), 3, axis=1)
+    alpha = pictures[0].image[..., 3:].astype(np.float32) / (255 if pictures[0].image.dtype == np.uint8 else 1)
+    green = np.array([0.1, 0.75, 0.2])
+    assert (alpha > 0).any()
+    np.testing.assert_allclose(truth[alpha[..., 0] == 0], np.broadcast_to(green, ((alpha == 0).sum(), 3)), atol=1e-6)
+    assert np.abs(truth - green)[alpha[..., 0] == 1].max() > 0.2
+    np.testing.assert_allclose(opacity, np.full_like(opacity, opaque), atol=1e-6)
+    assert np.allclose(rendering, green, atol=1e-6) == (not opaque)
 
 
 # -- what the map shows
@@ -232,7 +258,8 @@ def test_a_dry_run_tells_the_points(tmp_path: Path, edge_se: Any) -> None:
     lines = answer.out.splitlines()
     assert lines[0] == "point  0: base"
     assert len(lines) == len(points()) + 1
-    assert lines[-1] == f"{80 * len(points())} trainings of 300 steps, {80 * len(points())} still to do"
+    every = 10 * len(STRATEGIES) * len(points())
+    assert lines[-1] == f"{every} trainings of 300 steps, {every} still to do"
     assert list(tmp_path.iterdir()) == []
 
 

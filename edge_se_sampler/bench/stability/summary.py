@@ -110,7 +110,9 @@ def draw_map(runs: list[dict[str, Any]]) -> Any:
     axis.imshow(rates, cmap="RdYlGn_r", vmin=0, vmax=1, aspect="auto")
     for row in rows:
         at = names.index(row["strategy"]), numbers.index(row["point"])
-        axis.text(*at, f"{row['failures']}/{row['runs']}", ha="center", va="center", fontsize=8)
+        rate = row["failures"] / row["runs"]
+        color = "white" if abs(rate - 0.5) > 0.35 else "black"
+        axis.text(*at, f"{row['failures']}/{row['runs']}", ha="center", va="center", fontsize=8, color=color)
     axis.set_xticks(range(len(names)), [STRATEGIES[name].label.replace(", ", ",\n") for name in names], fontsize=8)
     axis.xaxis.tick_top()
     axis.set_yticks(range(len(numbers)), [points()[number].label for number in numbers], fontsize=8)
@@ -149,16 +151,17 @@ def draw_survival(runs: list[dict[str, Any]]) -> Any:
     return figure
 
 
-def draw_sheet(runs: list[dict[str, Any]], views: Path, columns: int = 6) -> Any:
-    """What failed runs look like: some of each ending, their first held-out view."""
+def draw_sheet(runs: list[dict[str, Any]], views: Path, columns: int = 4) -> Any:
+    """What failed runs look like: some of each ending, as held-out view, rendering and opacity."""
     kept = [(run, views / f"point-{run['point']}-{run['strategy']}-{run['seed']}.png") for run in runs]
     by_ending = {how: [(run, path) for run, path in kept if run["outcome"] == how and path.exists()] for how in SHORT}
     by_ending = {how: found for how, found in by_ending.items() if found}
     if not by_ending:
         return None
     figure, axes = require_pyplot().subplots(
-        len(by_ending), columns, figsize=(1.55 * columns, 1.9 * len(by_ending)), squeeze=False
+        len(by_ending), columns, figsize=(3.0 * columns, 1.5 * len(by_ending) + 0.3), squeeze=False
     )
+    figure.suptitle("held-out view | rendering | opacity (white: opaque)", fontsize=9)
     for row, (how, found) in zip(axes, by_ending.items(), strict=True):
         spread = [found[i] for i in sorted({round(i) for i in np.linspace(0, len(found) - 1, columns)})]
         row[0].set_ylabel(f"{how}\n({len(found)} runs)", fontsize=8)

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +21,7 @@ from edge_se_sampler.bench.outcome import outcome
 from edge_se_sampler.bench.stability.point import STRATEGIES, Cell, Point, points
 from edge_se_sampler.bench.stability.scene import COLORS, behind, views
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render_view
+from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render_rays
 from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
@@ -87,7 +88,7 @@ def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Pat
     )  # fmt: skip
     config: TrainerConfig = registered_methods()["edge-se-nerf"].specification.config
     settings: dict[str, Any] = {"early": chosen.early, "late": chosen.late, "schedule": chosen.schedule}
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, edge_epsilon=chosen.epsilon, **settings)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=scale.rays, pixel_sampler=sampler)
     config = replace(
         config,
@@ -112,7 +113,7 @@ def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
 
     Returns:
         its place, of each network how it ended and what it shows, the fine one's share at LOOKS times, how many
-        networks began anew, CPU seconds. A failed one's first held-out view goes to views_folder.
+        networks began anew, CPU seconds. A failed one's portrait goes to views_folder.
     """
     torch.set_num_threads(1)
     keep_freed_memory()
@@ -134,7 +135,7 @@ def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
         told |= {f"{level}_{key}": round(value, 4) for key, value in asdict(shown).items()}
     if told["fine_ending"] != "learnt":
         views_folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(views_folder / f"{cell.name}.png", png_bytes(render_view(model, pictures[0])[0]))
+        write_atomically(views_folder / f"{cell.name}.png", png_bytes(portrait(model, pictures[0])))
     return {
         **asdict(cell),
         **point.changes,
@@ -145,6 +146,18 @@ def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
         "shares": shares,
         "cpu_seconds": round(time.process_time() - began, 2),
     }
+
+
+def portrait(model: NeRFModel, picture: Picture) -> np.ndarray:
+    """A held-out view, what the fine network renders of it, and its opacity, side by side: (H, 3 W, 3) in [0, 1]."""
+    height, width, channels = picture.image.shape
+    rays = picture.rays(model.device)
+    rendered, opacity, background = (
+        render_rays(model, rays, key) for key in ("rgb_fine", "accumulation_fine", "background")
+    )
+    truth = target_colors(torch.from_numpy(picture.image).reshape(-1, channels), background)
+    panels = [panel.expand(-1, 3).reshape(height, width, 3) for panel in (truth, rendered, opacity)]
+    return torch.cat(panels, dim=1).clamp(0, 1).numpy()
 
 
 @torch.no_grad()
