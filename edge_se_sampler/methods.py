@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.engine.config import PipelineConfig, TrainerConfig
-from edge_se_sampler.nerf.config import InfoNeRFModelConfig, NeRFModelConfig
+from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig
+from edge_se_sampler.nerf.config import InfoNeRFModelConfig, LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.protocol import MethodSpecification
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 
@@ -36,6 +36,9 @@ INFO_NERF = {
 """Name -> strategy, description: the paper's other method. The other strategies by flag."""
 
 
+LEAN = "lean-nerf"
+
+
 def _specification(name: str) -> MethodSpecification:
     model: NeRFModelConfig = InfoNeRFModelConfig() if name in INFO_NERF else NeRFModelConfig()
     strategy, description = INFO_NERF.get(name, (name, ""))
@@ -43,6 +46,15 @@ def _specification(name: str) -> MethodSpecification:
     sampler = EdgeSEPixelSamplerConfig(early=early, late=late)  # pyright: ignore[reportArgumentType]
     pipeline = PipelineConfig(datamanager=VanillaDataManagerConfig(pixel_sampler=sampler), model=model)
     return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description or of_strategy)
+
+
+def _lean() -> MethodSpecification:
+    """What we recommend."""
+    sampler = EdgeSEPixelSamplerConfig(early="uniform", late="uniform", images_per_step="all")
+    manager = VanillaDataManagerConfig(live_pixels_only=True, pixel_sampler=sampler)
+    pipeline, adam = PipelineConfig(manager, LeanModelConfig()), OptimizerConfig(eps=1e-15, fused=True)
+    config = TrainerConfig(method_name=LEAN, pipeline=pipeline, optimizer=adam)
+    return MethodSpecification(config, "One small network, asked only where the scene is: what we recommend")
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,8 @@ def registered_methods() -> dict[str, RegisteredMethod]:
     An entry point that fails to load, is no MethodSpecification or takes a name that exists is left out with
     one line on stderr; it must not keep the others from working.
     """
-    methods = {name: RegisteredMethod(_specification(name), "edge_se_sampler") for name in (*STRATEGIES, *INFO_NERF)}
+    ours = {name: _specification(name) for name in (*STRATEGIES, *INFO_NERF)} | {LEAN: _lean()}
+    methods = {name: RegisteredMethod(specification, "edge_se_sampler") for name, specification in ours.items()}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
         origin = entry.dist.name if entry.dist else entry.value
         try:

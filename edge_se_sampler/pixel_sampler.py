@@ -18,6 +18,7 @@ from torch import Tensor
 
 from edge_se_sampler.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.edges import WHITE, edge_strength
+from edge_se_sampler.error_memory import ErrorMemory
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
 from edge_se_sampler.plain_background import PlainBackgrounds, summed_up
@@ -67,7 +68,9 @@ class ImportantPixels:
         self.watch: Watch | None = None
         """Decides the phase under schedule "auto"."""
         self.trained_on: dict[str, Any] | None = None
-        """Under "auto" the last batch's pixels, until their errors are observed."""
+        """The last batch's pixels, until their errors are observed, if somebody wants to know them."""
+        self.memory: ErrorMemory | None = None
+        """Scores candidates under se_scoring "memory"."""
         self._backgrounds = PlainBackgrounds()
         self._tables: dict[str, _Tables] = {}
 
@@ -85,6 +88,8 @@ class ImportantPixels:
         """
         self._squared_error = squared_error
         self.watch = Watch() if self.config.schedule == "auto" else None
+        remembers = self.config.late == "se" and self.config.se_scoring == "memory"
+        self.memory = ErrorMemory() if remembers else None
         self._early_steps = self.config.early_length(planned_steps)
         self._seed = seed
         self._rank, self._world = rank, world
@@ -94,20 +99,27 @@ class ImportantPixels:
         self._step = step
 
     def observe(self, squared_error: Tensor) -> None:
-        """What training found at the pixels of the last batch; under "auto" the phase follows from it.
+        """What training found at the pixels of the last batch: under "auto" the phase follows from it, and what is
+        remembered.
 
         Args:
             squared_error: (n,) of the model's (fine) colours.
         """
-        if self.watch is None or self.trained_on is None:
+        if self.trained_on is None:
             return
         pixels, self.trained_on = self.trained_on, None
+        if self.memory is not None:
+            found = squared_error.detach().double().cpu().numpy()
+            self.memory.note(pixels["indices"].cpu().numpy(), found, self._step)
+        if self.watch is None:
+            return
         rows = slice(None, None, max(1, len(squared_error) // WATCHED))
-        image, numbers = (pixels[key][rows].cpu().numpy() for key in ("image", "numbers"))
+        image, numbers = pixels["image"][rows].cpu().numpy(), pixels["indices"][rows, 0].cpu().numpy()
         distance = self._backgrounds.squared_distance(image, numbers, self.background)
         relative = pixels["edges"].relative(pixels["places"], pixels["drawn"][rows]).numpy()
         error = squared_error.detach()[rows].float().cpu().numpy()
-        self.watch.observe(*summed_up(error, distance, relative, by_edge=self.strategy == "edge"))
+        kept = 1.0 if pixels["kept"] is None else pixels["kept"][rows].numpy()
+        self.watch.observe(*summed_up(error, distance, relative, by_edge=self.strategy == "edge", kept=kept))
 
     @property
     def follows_training(self) -> bool:
@@ -169,6 +181,8 @@ class ImportantPixels:
         """
         batch = ImageBatch.of(image_batch, use_mask=not self.config.ignore_mask)
         strategy, count = self.strategy, self.num_rays_per_batch
+        if self.memory is not None:
+            self.memory.add(dict(zip(batch.numbers.tolist(), batch.sizes, strict=True)))
         if not self.follows_training:
             self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
         for over in set(self._tables) - {strategy, "uniform"} if self.watch is None else ():
@@ -233,32 +247,40 @@ class ImportantPixels:
             raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
         return source, places, drawable
 
-    def _await_errors(self, batch: ImageBatch, drawn: Tensor, pixels: dict[str, Any]) -> None:
-        """Under "auto", keep what `observe` will need of drawn pixels."""
+    def _await_errors(
+        self, batch: ImageBatch, drawn: Tensor, pixels: dict[str, Any], kept: Tensor | None = None
+    ) -> None:
+        """Keep what `observe` will need of drawn pixels, and of how likely each was kept, if not all were."""
+        if self.watch is None and self.memory is None:
+            return
+        self.trained_on = {"image": pixels["image"], "indices": pixels["indices"], "drawn": drawn.cpu(), "kept": kept}
         if self.watch is not None:
             self._backgrounds.look_at(batch)
             edges, places = self.distribution(batch, "edge")
-            self.trained_on = {
-                "image": pixels["image"], "numbers": pixels["indices"][:, 0],
-                "edges": edges, "places": places, "drawn": drawn.cpu(),
-            }  # fmt: skip
+            self.trained_on |= {"edges": edges, "places": places}
 
     def _candidates(self, batch: ImageBatch, count: int) -> dict[str, Any]:
         """Score uniform candidates and keep `count` of them by rank."""
         assert self._squared_error is not None
         drawn, _ = self._draw(batch, "uniform", self.config.se_candidates * count)
         candidates = batch.gather(drawn)
-        with torch.no_grad():
-            errors = self._squared_error(candidates)
-        if errors.shape != (len(drawn),):
-            raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
-        self._await_errors(batch, drawn, candidates)
-        self.observe(errors)
+        if self.memory is not None:
+            indices = candidates["indices"].cpu().numpy()
+            errors = torch.from_numpy(self.memory.recall(indices, self._step, count))
+        else:
+            with torch.no_grad():
+                errors = self._squared_error(candidates)
+            if errors.shape != (len(drawn),):
+                raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
+            self._await_errors(batch, drawn, candidates)
+            self.observe(errors)
         kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION, self._rank))
         pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
+        relative = kept.inclusion / (count / len(drawn))  # to what it would be without ranks
+        if self.memory is not None:
+            self._await_errors(batch, drawn[kept.rows.cpu()], pixels, relative.cpu())
         if self.config.importance_weight:
-            share = count / len(drawn)  # what every candidate's inclusion would be without ranks
-            pixels["weight"] = (kept.inclusion / share).to(batch.device) ** -self.config.importance_weight
+            pixels["weight"] = relative.to(batch.device) ** -self.config.importance_weight
         return pixels
 
 

@@ -12,7 +12,7 @@ VISIBLE = 0.01
 
 
 def summed_up(
-    error: np.ndarray, distance: np.ndarray, relative: np.ndarray, by_edge: bool
+    error: np.ndarray, distance: np.ndarray, relative: np.ndarray, by_edge: bool, kept: np.ndarray | float = 1.0
 ) -> tuple[float, float, float, float]:
     """What a step's pixels say of both ways of drawing, by importance weights (see `schedule`).
 
@@ -21,11 +21,12 @@ def summed_up(
         distance: (n,) b, see `PlainBackgrounds.squared_distance`.
         relative: (n,) p / u.
         by_edge: whether edge sampling drew them; else uniform sampling did.
+        kept: (n,) how much likelier than on average each was kept of what was drawn.
 
     Returns:
         how many show the object, E[e], E[b], U[e].
     """
-    as_edge, as_uniform = (1.0, 1 / relative) if by_edge else (relative, 1.0)
+    as_edge, as_uniform = (1.0, 1 / relative) if by_edge else (relative / kept, 1 / kept)
     means = (np.mean(values) for values in (error * as_edge, distance * as_edge, error * as_uniform))
     edge_error, edge_background, uniform_error = map(float, means)
     return float(np.count_nonzero(distance > VISIBLE)), edge_error, edge_background, uniform_error

@@ -42,9 +42,9 @@ class SamplingSettings:
     """Strength that every pixel has besides its edge (epsilon of equation 5), so that none has probability 0."""
     se_candidates: int = 2
     """Candidates scored for each pixel that squared-error sampling keeps."""
-    se_scoring: Literal["exact", "coarse"] = "exact"
-    """What scores the candidates: the fine colours (the paper), or the coarse network's alone, for a third of the
-    cost."""
+    se_scoring: Literal["exact", "coarse", "memory"] = "exact"
+    """What scores the candidates: the fine colours (the paper); the coarse network's alone, for a third of the cost;
+    or, for next to nothing, what training found there the last times."""
     importance_weight: float = 0.0
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of them."""

@@ -168,7 +168,7 @@ def test_a_perfect_network_has_learnt(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_a_point_is_trained_as_it_says(point: Point, tmp_path: Path) -> None:
     trainer, pictures = trainer_of(point, "auto", 3, SMALL, tmp_path)
     assert len(trainer.pipeline.datamanager.image_batch["image"]) == point.views
-    assert trainer.config.pipeline.model.density_noise == point.noise
+    assert trainer.pipeline.model.config.density_noise == point.noise
     assert trainer.pipeline.datamanager.train_pixel_sampler.watch is not None
     assert trainer.revival is not None
     for name, epsilon in (("auto", 0.01), ("auto-sharper", 0.001)):

@@ -14,6 +14,7 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerf.config import NeRFModelConfig
 
 NAN, INF = float("nan"), float("inf")
 
@@ -52,6 +53,7 @@ def test_the_largest_image_decides() -> None:
 def test_the_papers_size_is_the_papers() -> None:
     plan = planned(config_with("pipeline.model.size", "paper"), of_size(8, 8))
     model = plan.pipeline.model
+    assert isinstance(model, NeRFModelConfig)
     assert (model.depth, model.width) == (8, 256)
     assert (model.position_frequencies, model.direction_frequencies) == (10, 4)
     assert (model.num_coarse_samples, model.num_importance_samples) == (64, 128)

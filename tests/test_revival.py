@@ -16,7 +16,7 @@ from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
-from edge_se_sampler.engine.revival import LEVELS, PATIENCE, dead_networks
+from edge_se_sampler.engine.revival import PATIENCE, dead_networks
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import STRATEGIES, registered_methods
@@ -74,16 +74,16 @@ def test_networks_dead_at_the_start_begin_anew_under_every_strategy(method: str,
     ]
 
 
-@pytest.mark.parametrize("dead", LEVELS)
+@pytest.mark.parametrize("dead", NeRFModel.levels)
 def test_only_the_dead_one_begins_anew(dead: str, tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path)
-    model, (other,) = trainer.pipeline.model, [level for level in LEVELS if level != dead]
+    model, (other,) = trainer.pipeline.model, [level for level in NeRFModel.levels if level != dead]
     kill(model, dead)
     for step in range(PATIENCE - 1):
         trainer.train_iteration(step)
-    before = {level: weights(model, level) for level in LEVELS}
+    before = {level: weights(model, level) for level in NeRFModel.levels}
     trainer.train_iteration(PATIENCE - 1)
-    moved = {level: float((weights(model, level) - before[level]).abs().max()) for level in LEVELS}
+    moved = {level: float((weights(model, level) - before[level]).abs().max()) for level in NeRFModel.levels}
     assert moved[dead] > 0.3  # new weights
     assert 0 < moved[other] < 0.05  # a step of training
     assert trainer.revival is not None

@@ -53,7 +53,7 @@ def test_gradients_gathered_chunk_by_chunk_are_those_of_the_whole(
         forward = model.forward
         monkeypatch.setattr(model, "forward", lambda rays, go=forward, s=sizes: (s.append(len(rays)), go(rays))[1])
         spread = {count: torch.linspace(0.05, 0.95, count) for count in (5, 6)}
-        monkeypatch.setattr(model, "_uniform", lambda rows, columns, s=spread: s[columns].expand(rows, columns))
+        monkeypatch.setattr(model, "uniform", lambda rows, columns, s=spread: s[columns].expand(rows, columns))
         loss = trainer.train_iteration(0)
         assert sizes == [chunk] * (RAYS // chunk) + ([RAYS % chunk] if RAYS % chunk else [])
         found.append((loss, gradients(trainer)))

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -55,6 +55,11 @@ class Views:
             None if self.masks is None else tuple(self.masks[i] for i in chosen),
             *(values[chosen] for values in (self.camera_to_worlds, self.focal, self.principal)),
         )
+
+    def masked(self, masks: Sequence[np.ndarray]) -> Views:
+        """The same views, of which only these pixels (and those that could be already) may be trained on."""
+        old = [True] * len(masks) if self.masks is None else self.masks
+        return replace(self, masks=tuple(mask & may for mask, may in zip(masks, old, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.nerf.config import NeRFModelConfig
+from edge_se_sampler.nerf.config import ModelConfig, NeRFModelConfig
 from edge_se_sampler.protocol import InstantiateConfig
 
 
@@ -28,7 +28,7 @@ class PipelineConfig:
     """Data manager and model."""
 
     datamanager: VanillaDataManagerConfig = field(default_factory=VanillaDataManagerConfig)
-    model: NeRFModelConfig = field(default_factory=NeRFModelConfig)
+    model: ModelConfig = field(default_factory=NeRFModelConfig)
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class OptimizerConfig:
     """Learning rate at the end of the planned iterations, as a share of the initial one."""
     eps: float = 1e-8
     """Adam's epsilon."""
+    fused: bool = False
+    """Take the step in one pass over the weights: faster, and rounded a little differently."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from edge_se_sampler.cameras import RayBundle, RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.edges import edge_strength, unit_float
-from edge_se_sampler.nerf.model import NeRFModel, target_colors
+from edge_se_sampler.nerf.ray_model import RayModel, target_colors
 
 EDGE_BAND_SHARE = 0.1
 """The edge band: the share of pixels with the strongest Sobel response, and their neighbours."""
@@ -47,12 +47,12 @@ def pictures_of(views: Views) -> list[Picture]:
     return [Picture(name, unit_float(views.images[i]), generator, i) for i, name in names]
 
 
-def shade_behind(model: NeRFModel) -> float:
+def shade_behind(model: RayModel) -> float:
     """The background that a model is evaluated on."""
     return 0.0 if model.config.background_color == "black" else 1.0
 
 
-def render_rays(model: NeRFModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
+def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
     """An output of all rays, on the CPU, without gradients and in evaluation mode."""
     was_training = model.training
     model.eval()
@@ -68,7 +68,7 @@ def target_image(picture: Picture, shade: float) -> np.ndarray:
     return target_colors(image, torch.full((3,), shade)).numpy().reshape(*picture.image.shape[:2], 3)
 
 
-def render_view(model: NeRFModel, picture: Picture) -> tuple[np.ndarray, float]:
+def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
     """A view's rendering (H, W, 3) in [0, 1] and its PSNR.
 
     Raises:
@@ -135,7 +135,7 @@ def measures(rendered: np.ndarray, picture: Picture, shade: float) -> dict[str, 
 
 
 def evaluate(
-    model: NeRFModel, pictures: list[Picture], each: Callable[[int, Picture, np.ndarray], None] | None = None
+    model: RayModel, pictures: list[Picture], each: Callable[[int, Picture, np.ndarray], None] | None = None
 ) -> dict[str, Any]:
     """Render every picture and measure all of its pixels, masked ones too.
 

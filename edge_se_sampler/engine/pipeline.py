@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.nerf.economy import live_pixels, needs
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.ray_model import RayModel
 from edge_se_sampler.streams import Stream, stream
 
 SHADES = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
@@ -19,18 +22,25 @@ class Pipeline:
     """What callbacks and scoring may reach; nerfstudio's pipelines have the same two."""
 
     datamanager: VanillaDataManager
-    model: NeRFModel
+    model: Any
+    """A RayModel."""
 
     @classmethod
     def build(cls, config: TrainerConfig, views: Views, device: str) -> Pipeline:
         """Set up both for a planned config."""
         model_config = config.pipeline.model
+        model = build_model(config, device)
+        if model.needs_cells:
+            hull = needs(views, model_config).hull
+            model.settle(OccupancyGrid.of(hull))
+            if config.pipeline.datamanager.live_pixels_only:
+                views = views.masked(live_pixels(views, hull))
         datamanager = config.pipeline.datamanager.setup(
             views=views, device=device, background_color=SHADES[model_config.background_color]
         )
-        return cls(datamanager, build_model(config, device))
+        return cls(datamanager, model)
 
 
-def build_model(config: TrainerConfig, device: str) -> NeRFModel:
+def build_model(config: TrainerConfig, device: str) -> RayModel:
     """The model with its initial weights: a function of the seed and the size alone, whatever the method."""
     return config.pipeline.model.setup(rng=stream(config.machine.seed, 0, Stream.WEIGHTS)).to(device)

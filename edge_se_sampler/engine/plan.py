@@ -7,7 +7,14 @@ from dataclasses import replace
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf.config import SIZES, InfoNeRFModelConfig, resolved, size_for
+from edge_se_sampler.nerf.config import (
+    InfoNeRFModelConfig,
+    LeanModelConfig,
+    NeRFModelConfig,
+    preset_of,
+    resolved,
+    size_for,
+)
 
 
 def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
@@ -19,7 +26,7 @@ def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
     side = max(max(image.shape[:2]) for image in views.images)
     model = config.pipeline.model
     size = size_for(side) if model.size == "auto" else model.size
-    preset = SIZES[size]
+    preset = preset_of(model, size)
     manager = config.pipeline.datamanager
     rays = preset.rays if manager.train_num_rays_per_batch is None else manager.train_num_rays_per_batch
     iterations = preset.iterations if config.max_num_iterations is None else config.max_num_iterations
@@ -51,8 +58,11 @@ def _check(plan: TrainerConfig) -> None:
         "steps-per-log": plan.steps_per_log,
         "pipeline.datamanager.train-num-rays-per-batch": plan.pipeline.datamanager.train_num_rays_per_batch,
         "pipeline.model.depth": model.depth,
-        "pipeline.model.num-importance-samples": model.num_importance_samples,
     }
+    if isinstance(model, NeRFModelConfig):
+        at_least_one["pipeline.model.num-importance-samples"] = model.num_importance_samples
+    if isinstance(model, LeanModelConfig):
+        at_least_one["pipeline.model.features"] = model.features
     for flag, value in at_least_one.items():
         if value is None or value < 1:
             raise InputError(f"--{flag} is {value}: must be at least 1")
@@ -60,15 +70,17 @@ def _check(plan: TrainerConfig) -> None:
         raise InputError(
             f"--pipeline.model.width is {model.width}: must be at least 2 (the direction's layer has half)"
         )
-    if (model.num_coarse_samples or 0) < 3:
-        raise InputError(f"--pipeline.model.num-coarse-samples is {model.num_coarse_samples}: must be at least 3")
+    if isinstance(model, NeRFModelConfig):
+        _check_nerf(model)
+    if isinstance(model, LeanModelConfig):
+        _check_lean(plan, model)
     for flag, frequencies in (("position", model.position_frequencies), ("direction", model.direction_frequencies)):
         if frequencies is None or not 0 <= frequencies <= 24:
             raise InputError(f"--pipeline.model.{flag}-frequencies is {frequencies}: must be between 0 and 24")
     if not 0 <= model.near < model.far < float("inf"):
         raise InputError(f"--pipeline.model.near is {model.near}, --pipeline.model.far {model.far}: 0 <= near < far")
-    if not 0 <= model.density_noise < float("inf"):
-        raise InputError(f"--pipeline.model.density-noise is {model.density_noise}: must be at least 0")
+    if not 0 < model.cell_pixels < float("inf"):
+        raise InputError(f"--pipeline.model.cell-pixels is {model.cell_pixels}: must be above 0")
     if isinstance(model, InfoNeRFModelConfig):
         _check_info(model)
     if plan.max_seconds is not None and not plan.max_seconds > 0:
@@ -82,6 +94,21 @@ def _check(plan: TrainerConfig) -> None:
     for name in (plan.method_name, plan.experiment_name):
         if name in (None, "", ".", "..") or "/" in str(name) or "\0" in str(name):
             raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
+
+
+def _check_nerf(model: NeRFModelConfig) -> None:
+    if (model.num_coarse_samples or 0) < 3:
+        raise InputError(f"--pipeline.model.num-coarse-samples is {model.num_coarse_samples}: must be at least 3")
+    if not 0 <= model.density_noise < float("inf"):
+        raise InputError(f"--pipeline.model.density-noise is {model.density_noise}: must be at least 0")
+
+
+def _check_lean(plan: TrainerConfig, model: LeanModelConfig) -> None:
+    for flag, value in {"step-cells": model.step_cells, "feature-rate": model.feature_rate}.items():
+        if not 0 < value < float("inf"):
+            raise InputError(f"--pipeline.model.{flag} is {value}: must be above 0")
+    if getattr(plan.pipeline.datamanager.pixel_sampler, "se_scoring", "exact") == "coarse":
+        raise InputError("--pipeline.datamanager.pixel-sampler.se-scoring is coarse: this model has no coarse network")
 
 
 def _check_info(model: InfoNeRFModelConfig) -> None:

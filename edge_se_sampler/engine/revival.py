@@ -15,22 +15,21 @@ import torch
 from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.engine.evaluation import render_rays
 from edge_se_sampler.nerf.field import NeRFField
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.nerf.ray_model import RayModel
 from edge_se_sampler.streams import Stream, stream
 
 PATIENCE = 8
 """Batches in a row without any density gradient, before the probe is asked."""
 PROBE_RAYS = 512
-LEVELS = ("coarse", "fine")
 
 
-def dead_networks(model: NeRFModel, probes: Iterable[RayBundle]) -> list[str]:
-    """Which of "coarse" and "fine" have no density at any sample of the rays.
+def dead_networks(model: RayModel, probes: Iterable[RayBundle]) -> list[str]:
+    """Which of its networks have no density at any sample of the rays.
 
     The last interval is endless: the least density anywhere would make its ray opaque.
     """
     parts = list(probes)
-    return [level for level in LEVELS if not any(render_rays(model, r, f"accumulation_{level}").any() for r in parts)]
+    return [lvl for lvl in model.levels if not any(render_rays(model, r, f"accumulation_{lvl}").any() for r in parts)]
 
 
 class Revival:
@@ -42,15 +41,15 @@ class Revival:
         seed: the run's.
     """
 
-    def __init__(self, model: NeRFModel, optimizer: torch.optim.Optimizer, probe: RayBundle, seed: int) -> None:
+    def __init__(self, model: RayModel, optimizer: torch.optim.Optimizer, probe: RayBundle, seed: int) -> None:
         self.model, self.optimizer, self.probe, self.seed = model, optimizer, probe, seed
-        self.silent = dict.fromkeys(LEVELS, 0)
+        self.silent = dict.fromkeys(model.levels, 0)
         self.used = 0
 
     def after_backward(self) -> dict[str, int]:
         """Look at the gradients of a step; the networks that were given new weights, and of which sub-seed."""
         suspects = []
-        for level in LEVELS:
+        for level in self.model.levels:
             gradient = getattr(self.model, level).density.weight.grad
             self.silent[level] = 0 if gradient.any() else self.silent[level] + 1
             if self.silent[level] >= PATIENCE:

@@ -19,7 +19,8 @@ from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.nerf.config import ModelConfig, NeRFModelConfig
+from edge_se_sampler.nerf.ray_model import RayModel
 from edge_se_sampler.sampling_settings import SamplingSettings
 
 
@@ -53,7 +54,7 @@ def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
     return trainer
 
 
-def load_model(run: RunFolder) -> tuple[TrainerConfig, NeRFModel, Path]:
+def load_model(run: RunFolder) -> tuple[TrainerConfig, RayModel, Path]:
     """A run's settings, its model with the last checkpoint's weights, and that checkpoint.
 
     Raises:
@@ -127,8 +128,7 @@ def summary(config: TrainerConfig, run: RunFolder) -> str:
     )
     lines = [
         f"run      {run.path}",
-        f"model    {model.size}: {model.depth} x {model.width}, {model.num_coarse_samples} + "
-        f"{model.num_importance_samples} samples a ray",
+        f"model    {model.size}: {model.depth} x {model.width}, {_samples(model)}",
         f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
     ]
     if isinstance(sampler, SamplingSettings):
@@ -137,6 +137,12 @@ def summary(config: TrainerConfig, run: RunFolder) -> str:
             until = f"for {math.ceil(sampler.early_length(config.max_num_iterations or 0))} iterations"
         lines.append(f"pixels   {sampler.early} {until}, then {sampler.late}")
     return "\n".join(lines)
+
+
+def _samples(model: ModelConfig) -> str:
+    if isinstance(model, NeRFModelConfig):
+        return f"{model.num_coarse_samples} + {model.num_importance_samples} samples a ray"
+    return "samples where the scene is"
 
 
 def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:

@@ -39,7 +39,12 @@ class Trainer:
     def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
         self.planned_steps = config.max_num_iterations or 0
-        self.optimizer = torch.optim.Adam(self.pipeline.model.parameters(), lr=1.0, eps=config.optimizer.eps)
+        groups = pipeline.model.parameter_groups()
+        adam = config.optimizer
+        self.optimizer = torch.optim.Adam(
+            [{"params": weights} for weights, _ in groups], 1.0, eps=adam.eps, fused=adam.fused or None
+        )
+        self.rates = [rate for _, rate in groups]
         self.next_step = 0
         self.elapsed = 0.0
         self.events = EventWriter(run.path)
@@ -122,8 +127,8 @@ class Trainer:
             rng = stream(seed, step, Stream.UNSEEN)
             unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, rng)
             loss += self._backward(len(unseen), lambda rows: model.unseen_loss(unseen[rows]))
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate(step)
+        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
+            group["lr"] = rate * self.learning_rate(step)
         value = float(loss)
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
@@ -139,8 +144,8 @@ class Trainer:
 
     def _watched(self) -> list[tuple[str, Any]]:
         """What has a state besides the weights, and its name in a checkpoint."""
-        watch = getattr(self.pipeline.datamanager.train_pixel_sampler, "watch", None)
-        parts = {"revival": self.revival, "watch": watch}
+        sampler = self.pipeline.datamanager.train_pixel_sampler
+        parts = {"revival": self.revival} | {name: getattr(sampler, name, None) for name in ("watch", "memory")}
         return [(name, part) for name, part in parts.items() if part is not None]
 
     def _backward(self, rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:

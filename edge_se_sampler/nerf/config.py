@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from edge_se_sampler.protocol import InstantiateConfig
 
 
 @dataclass(frozen=True)
-class NeRFModelConfig(InstantiateConfig):
-    """The original NeRF: two networks, coarse and fine. What is left out (None) follows from the size."""
-
-    _target: ClassVar[type | str] = "edge_se_sampler.nerf.model:NeRFModel"
+class ModelConfig(InstantiateConfig):
+    """What every model has. What is left out (None) follows from the size."""
 
     size: Literal["auto", "paper", "small", "tiny"] = "auto"
     """Networks and samples: the paper's, or smaller ones for smaller images; auto decides by the images."""
@@ -24,22 +22,55 @@ class NeRFModelConfig(InstantiateConfig):
     """Frequencies that encode a position."""
     direction_frequencies: int | None = None
     """Frequencies that encode a direction."""
-    num_coarse_samples: int | None = None
-    """Stratified samples along a ray."""
-    num_importance_samples: int | None = None
-    """Further samples of the fine network, where the coarse one has seen something."""
-    density_activation: Literal["relu", "softplus"] = "relu"
-    """What makes the raw density non-negative; softplus (shifted by 1, the last interval finite) cannot die."""
     initialization: Literal["xavier", "torch"] = "xavier"
     """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
-    density_noise: float = 0.0
-    """Standard deviation of noise added to the raw density in training."""
     background_color: Literal["white", "black", "random"] = "white"
     """What is behind the scene; random: another colour for every training ray, white in evaluation."""
     near: float = 2.0
     """Depth along the optical axis at which samples begin, world units."""
     far: float = 6.0
     """Depth at which samples end."""
+    economy: Literal["auto", "off"] = "off"
+    """Whether what the scene does not need is left out: auto derives it from cameras and alpha, see inspect."""
+    cell_pixels: float = 1.6
+    """Side of a cell that is kept or left out, in pixels' footprints at the middle of the scene; larger where there
+    would be more cells than are worth their memory."""
+
+
+@dataclass(frozen=True)
+class NeRFModelConfig(ModelConfig):
+    """The original NeRF: two networks, coarse and fine. Under economy auto neither is asked outside of the hull."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.nerf.model:NeRFModel"
+
+    num_coarse_samples: int | None = None
+    """Stratified samples along a ray."""
+    num_importance_samples: int | None = None
+    """Further samples of the fine network, where the coarse one has seen something."""
+    density_activation: Literal["relu", "softplus"] = "relu"
+    """What makes the raw density non-negative; softplus (shifted by 1, the last interval finite) cannot die."""
+    density_noise: float = 0.0
+    """Standard deviation of noise added to the raw density in training."""
+
+
+@dataclass(frozen=True)
+class LeanModelConfig(ModelConfig):
+    """One small network on features that are kept where the scene is, asked only there."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.nerf.lean:LeanModel"
+
+    economy: Literal["auto", "off"] = "auto"
+    """Whether the parts below are at work; off: samples along all of the box."""
+    cull_by_alpha: bool = True
+    """Leave out what lies outside of the alpha masks' visual hull."""
+    cull_by_density: bool = True
+    """Leave out where training has seen no density; such cells are tried again now and then."""
+    step_cells: float = 1.0
+    """Distance between samples, in sides of a cell."""
+    features: int = 8
+    """Numbers kept at each corner of a cell."""
+    feature_rate: float = 10.0
+    """Learning rate of the features, in the network's."""
 
 
 @dataclass(frozen=True)
@@ -65,22 +96,37 @@ class InfoNeRFModelConfig(NeRFModelConfig):
     """Iterations between two such decays."""
 
 
+Model = TypeVar("Model", bound=ModelConfig)
+
+
 @dataclass(frozen=True)
-class SizePreset:
+class SizePreset(Generic[Model]):
     """One size: the model, and a plan of training that suits it."""
 
-    model: NeRFModelConfig
+    model: Model
     learning_rate: float
     rays: int
     iterations: int
 
 
+def _nerf(size: Any, width: int, depth: int, position: int, direction: int, coarse: int, fine: int) -> NeRFModelConfig:
+    shape = NeRFModelConfig(size, width, depth, position, direction)
+    return replace(shape, num_coarse_samples=coarse, num_importance_samples=fine)
+
+
 # tiny is wide rather than deep: 0.4 % of 500 seeds begin with a dead network, where 4 x 64 has 3.7 % of 300, at the
 # same quality for the same steps. At a rate of 5e-3 one of 18 seeds lost a network early, at 2.5e-3 to 3e-3 none of 12.
-SIZES: dict[str, SizePreset] = {
-    "paper": SizePreset(NeRFModelConfig("paper", 256, 8, 10, 4, 64, 128), 5e-4, 1024, 200_000),
-    "small": SizePreset(NeRFModelConfig("small", 128, 4, 8, 3, 48, 48), 2e-3, 512, 20_000),
-    "tiny": SizePreset(NeRFModelConfig("tiny", 96, 2, 6, 2, 32, 32), 3e-3, 512, 1_500),
+SIZES: dict[str, SizePreset[NeRFModelConfig]] = {
+    "paper": SizePreset(_nerf("paper", 256, 8, 10, 4, 64, 128), 5e-4, 1024, 200_000),
+    "small": SizePreset(_nerf("small", 128, 4, 8, 3, 48, 48), 2e-3, 512, 20_000),
+    "tiny": SizePreset(_nerf("tiny", 96, 2, 6, 2, 32, 32), 3e-3, 512, 1_500),
+}
+
+
+LEAN: dict[str, SizePreset[LeanModelConfig]] = {
+    "paper": SizePreset(LeanModelConfig("paper", 64, 2, 4, 2), 2e-3, 1024, 30_000),
+    "small": SizePreset(LeanModelConfig("small", 64, 2, 4, 2), 2e-3, 512, 20_000),
+    "tiny": SizePreset(LeanModelConfig("tiny", 64, 2, 4, 2), 2e-3, 256, 12_000),
 }
 
 
@@ -91,9 +137,14 @@ def size_for(pixels_a_side: int) -> str:
     return "small" if pixels_a_side <= 256 else "paper"
 
 
-def resolved(config: NeRFModelConfig, size: str, rays: int) -> NeRFModelConfig:
+def preset_of(config: ModelConfig, size: str) -> SizePreset[Any]:
+    """What a size stands for, with this kind of model."""
+    return (LEAN if isinstance(config, LeanModelConfig) else SIZES)[size]
+
+
+def resolved(config: Model, size: str, rays: int) -> Model:
     """The config with every None replaced by the size's value, or by a step's number of rays."""
-    preset = SIZES[size].model
+    preset = preset_of(config, size).model
     if isinstance(config, InfoNeRFModelConfig) and config.num_unseen_rays is None:
         config = replace(config, num_unseen_rays=rays)
     chosen = {key: getattr(preset, key) if value is None else value for key, value in vars(config).items()}

@@ -34,18 +34,16 @@ class NeRFField(nn.Module):
         width, depth = config.width or 0, config.depth or 0
         encoded = encoded_size(3, self.position_frequencies)
         widths = [encoded] + [width + encoded if i == SKIP_AFTER else width for i in range(1, depth)]
-        self.layers = nn.ModuleList(_linear(size, width) for size in widths)
-        self.density = _linear(width, 1)
-        self.feature = _linear(width, width)
-        self.view = _linear(width + encoded_size(3, self.direction_frequencies), width // 2)
-        self.color = _linear(width // 2, 3)
+        self.layers = nn.ModuleList(linear(size, width) for size in widths)
+        self.density = linear(width, 1)
+        self.feature = linear(width, width)
+        self.view = linear(width + encoded_size(3, self.direction_frequencies), width // 2)
+        self.color = linear(width // 2, 3)
         self.initialize(config.initialization, rng)
 
     def initialize(self, how: str, rng: np.random.Generator) -> None:
         """Give every layer initial weights, see `initialize`."""
-        for layer in self.modules():
-            if isinstance(layer, nn.Linear):
-                initialize(layer, how, rng)
+        initialize_all(self, how, rng)
 
     def forward(self, positions: Tensor, directions: Tensor, ray: Tensor | None, noise: Tensor | None = None):
         """Evaluate points.
@@ -83,11 +81,18 @@ class NeRFField(nn.Module):
         return F.relu(h, inplace=True)
 
 
-def _linear(in_size: int, out_size: int) -> nn.Linear:
+def linear(in_size: int, out_size: int) -> nn.Linear:
     """A layer still to be initialised; torch's own way would draw from its global generator."""
     layer = nn.utils.skip_init(nn.Linear, in_size, out_size)
     assert isinstance(layer, nn.Linear)
     return layer
+
+
+def initialize_all(field: nn.Module, how: str, rng: np.random.Generator) -> None:
+    """Give every layer initial weights, see `initialize`."""
+    for layer in field.modules():
+        if isinstance(layer, nn.Linear):
+            initialize(layer, how, rng)
 
 
 def initialize(layer: nn.Linear, how: str, rng: np.random.Generator) -> None:

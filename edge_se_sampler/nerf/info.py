@@ -84,7 +84,7 @@ class InfoNeRFModel(NeRFModel):
         config = self.config
         self.gain_weight = config.gain_weight * config.gain_rate ** (step // config.gain_steps)
         if self.gain_weight:
-            angles = 2 * self._uniform(1, 3)[0].cpu() - 1
+            angles = 2 * self.uniform(1, 3)[0].cpu() - 1
             self.rotation = turn(angles * math.radians(config.gain_degrees))
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The NeRF model: rays -> colours, by a coarse and a fine network."""
+"""The original NeRF: rays -> colours, by a coarse and a fine network."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.nerf.config import NeRFModelConfig
 from edge_se_sampler.nerf.field import NeRFField
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.ray_model import RayModel
 from edge_se_sampler.nerf.samples import importance, stratified
 from edge_se_sampler.nerf.volume import composite, intervals, sample_weights
 
@@ -19,7 +21,7 @@ POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
 value gives another (equally good) training run."""
 
 
-class NeRFModel(nn.Module):
+class NeRFModel(RayModel):
     """Coarse and fine networks, stratified and importance samples.
 
     Args:
@@ -27,17 +29,15 @@ class NeRFModel(nn.Module):
         rng: of the initial weights.
     """
 
+    levels = ("coarse", "fine")
+
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
-        super().__init__()
+        super().__init__(config)
         self.config = config
         self.coarse = NeRFField(config, rng)
         self.fine = NeRFField(config, rng)
-        self.random = torch.Generator()
-        """Of jitter, noise and random backgrounds; the trainer seeds it at every step."""
         self.occupied: Callable[[Tensor], Tensor] | None = None
         """Positions (m, 3) -> (m,) bool; where False, the density is 0 and no network is asked. None: everywhere."""
-        self.background: Callable[[RayBundle], Tensor] | None = None
-        """n rays -> (n, 3) colours behind them; None: what the config says."""
 
     @property
     def device(self) -> torch.device:
@@ -50,20 +50,13 @@ class NeRFModel(nn.Module):
         size = max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points)
         return (slice(start, start + size) for start in range(0, rays, size))
 
-    def begin_step(self, step: int, seed: int) -> None:
-        """Make the randomness of what follows a function of the seed, in a training step (0, 1, 2, ...)."""
-        if self.random.device != self.device:
-            self.random = torch.Generator(self.device)
-        self.random.manual_seed(seed)
+    def settle(self, grid: OccupancyGrid) -> None:
+        """Ask both networks only in the grid's cells from now on."""
+        super().settle(grid)
+        self.occupied = grid.contains
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
-        """Render rays; in training mode with jittered samples.
-
-        Returns:
-            rgb_coarse, rgb_fine (n, 3); accumulation_coarse, accumulation_fine (n, 1); depth_fine (n, 1) in
-            world units along the ray; background (n, 3) behind each ray; density_fine, delta_fine (n, s) of the
-            fine network's samples.
-        """
+        """As `RayModel`; and density_fine, delta_fine (n, s) of the fine network's samples."""
         t, weights, rgb, background = self._coarse(rays)
         outputs = {"rgb_coarse": rgb, "accumulation_coarse": weights.sum(1, keepdim=True), "background": background}
 
@@ -79,40 +72,21 @@ class NeRFModel(nn.Module):
         _, _, rgb, background = self._coarse(rays)
         return self.squared_error({"rgb_coarse": rgb, "background": background}, image, "coarse")
 
-    def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
-        """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.
-
-        Args:
-            image: (n, 3|4) straight-alpha pixels in [0, 1].
-        """
-        return (outputs[f"rgb_{level}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
-
-    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(n,) what training minimises the mean of on a batch's rays, and (n,) the fine colours' squared errors."""
-        return self.loss(self(rays), batch)
-
-    def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(n,) coarse + fine error of every ray, a mean over channels as in NeRF's code, times its weight if any; and
-        (n,) the fine squared error alone, without a gradient."""
-        fine = self.squared_error(outputs, batch["image"], "fine")
-        error = self.squared_error(outputs, batch["image"], "coarse") + fine
-        return (error * batch["weight"] / 3 if "weight" in batch else error / 3), fine.detach()
-
     def _coarse(self, rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of the coarse network: t and weights of its samples (n, s), colours, and backgrounds (n, 3)."""
         config, count = self.config, len(rays)
         samples = config.num_coarse_samples or 0
         norm = rays.metadata["directions_norm"]
-        jitter = self._uniform(count, samples) if self.training else None
+        jitter = self.uniform(count, samples) if self.training else None
         t = stratified(config.near * norm, config.far * norm, samples, jitter)
-        background = self._background(count) if self.background is None else self.background(rays)
+        background = self.behind(rays)
         weights, rgb, _ = self._render(self.coarse, rays, t, background)
         return t, weights, rgb, background
 
     def _importance(self, t: Tensor, weights: Tensor) -> Tensor:
         count = self.config.num_importance_samples or 0
         if self.training:
-            uniform = self._uniform(len(t), count)
+            uniform = self.uniform(len(t), count)
         else:
             uniform = torch.linspace(0, 1, count, dtype=t.dtype, device=t.device).expand(len(t), count)
         return importance((t[:, 1:] + t[:, :-1]) / 2, weights[:, 1:-1], uniform)
@@ -145,20 +119,3 @@ class NeRFModel(nn.Module):
         dtype = self.coarse.density.weight.dtype
         standard = torch.randn(count, generator=self.random, device=self.device, dtype=dtype)
         return standard * self.config.density_noise
-
-    def _uniform(self, rows: int, columns: int) -> Tensor:
-        dtype = self.coarse.density.weight.dtype
-        return torch.rand((rows, columns), generator=self.random, device=self.device, dtype=dtype)
-
-    def _background(self, count: int) -> Tensor:
-        if self.training and self.config.background_color == "random":
-            return self._uniform(count, 3)
-        shade = 0.0 if self.config.background_color == "black" else 1.0
-        return torch.full((count, 3), shade, device=self.device, dtype=self.coarse.density.weight.dtype)
-
-
-def target_colors(image: Tensor, background: Tensor) -> Tensor:
-    """What a ray should show: (n, 3|4) straight-alpha pixels composited on (n, 3) backgrounds."""
-    if image.shape[1] == 3:
-        return image
-    return image[:, :3] * image[:, 3:] + background * (1 - image[:, 3:])

@@ -90,8 +90,9 @@ def _follow(manager: Any, trainer: Any) -> list[TrainingCallback]:
         world=trainer.world_size,
     )
     callbacks = [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
-    if sampler.watch is not None:
+    if sampler.watch is not None or sampler.memory is not None:
         watch_training(trainer.pipeline.model, sampler)
+    if sampler.watch is not None:
         keep = remember_watch(trainer, sampler.watch)
         callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], keep))
     loader = manager.train_image_dataloader

@@ -41,10 +41,10 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
                 f"pixel-sampler.importance-weight is {self.importance_weight}: nerfstudio's losses take no weights; "
                 "leave it at 0, or train with edge-se"
             )
-        if self.se_scoring != "exact":
+        if self.se_scoring == "coarse":
             raise InputError(
                 f"pixel-sampler.se-scoring is {self.se_scoring!r}: nerfstudio's models render their coarse colours "
-                "only together with the fine ones; leave it at exact"
+                "only together with the fine ones; take exact or memory"
             )
         # both come from the cameras: the host's sampler then draws by solid angle, or inside the crop circle alone
         if bool(self.is_equirectangular):

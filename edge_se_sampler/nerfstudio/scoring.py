@@ -60,7 +60,7 @@ def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Ten
 
 
 def watch_training(model: nn.Module, sampler: ImportantPixels) -> None:
-    """Tell the sampler the errors of every training batch that the model renders (schedule "auto").
+    """Tell the sampler the errors of every training batch that the model renders (schedule "auto", remembered errors).
 
     Evaluation is not in training mode, and while candidates are scored the sampler waits for no batch.
     """

@@ -13,7 +13,6 @@ from edge_se_sampler.bench.paper.cell import LATE_SE, RANDOMS_TIME, TABLES, Cell
 from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.engine.trainer import choose_device
 from edge_se_sampler.nerf.config import resolved
-from edge_se_sampler.nerf.model import NeRFModel
 
 
 def plan_of(cells: list[Cell], done: int, preset: Preset, workers: int) -> str:
@@ -54,7 +53,8 @@ def _step_seconds(method: str, preset: Preset) -> float:
     table = next(number for number, table in TABLES.items() if table.method == method)
     config = config_of(Cell(table, "chair", "vanilla-nerf", 0), preset, Path(), Path())
     device = choose_device("auto")
-    model = NeRFModel(resolved(config.pipeline.model, preset.size, preset.rays), np.random.default_rng(0)).to(device)
+    model_config = resolved(config.pipeline.model, preset.size, preset.rays)
+    model = model_config.setup(rng=np.random.default_rng(0)).to(device)
     tried = min(preset.rays, 64)
     rays = RayBundle(
         torch.zeros((tried, 3), device=device),

@@ -25,13 +25,14 @@ from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render
 from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
-from edge_se_sampler.engine.revival import LEVELS, dead_networks
+from edge_se_sampler.engine.revival import dead_networks
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import keep_freed_memory
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf.config import NeRFModelConfig
-from edge_se_sampler.nerf.model import NeRFModel, target_colors
+from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.nerf.ray_model import target_colors
 
 Ending = Literal["learnt", "slow", "dead at the start", "killed by the data", "opaque background"]
 LEARNING_RATE = 3e-3
@@ -166,7 +167,7 @@ def measured(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict
     was_training = model.training
     model.eval()
     images = [torch.from_numpy(picture.image).reshape(-1, 4)[::stride] for picture in pictures]
-    errors, accumulations = ({level: [] for level in LEVELS} for _ in range(2))
+    errors, accumulations = ({level: [] for level in model.levels} for _ in range(2))
     distances = []
     for picture, image in zip(pictures, images, strict=True):
         rays = picture.rays(model.device)[::stride]
@@ -174,14 +175,14 @@ def measured(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict
             outputs = model(rays[rows])
             away = target_colors(image[rows], outputs["background"]) - outputs["background"]
             distances.append(away.square().sum(dim=1))
-            for level in LEVELS:
+            for level in model.levels:
                 errors[level].append(model.squared_error(outputs, image[rows], level))
                 accumulations[level].append(outputs[f"accumulation_{level}"][:, 0])
     model.train(was_training)
     distance, inside = torch.cat(distances), torch.cat(images)[:, 3] > 0
     return {
         level: _measured(torch.cat(errors[level]), torch.cat(accumulations[level]), distance, inside)
-        for level in LEVELS
+        for level in model.levels
     }
 
 

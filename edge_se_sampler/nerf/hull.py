@@ -1,0 +1,159 @@
+"""The visual hull (Laurentini 1994): what of a box may hold something, from the silhouettes that alpha shows.
+
+X      centre of a cell of side h, world units
+x, y, z  X in a view's camera: right, down, ahead
+a_x, ...  half of the cell along those axes: h/2 times the sum of |rotation| over the world's axes
+u, v   pixels right and down; f, c: focal length and principal point, pixels
+
+A point of the cell lies at (x + e_x, z + e_z) with |e_x| <= a_x, |e_z| <= a_z, so its pixel is within
+f (a_x z + |x| a_z) / (z (z - a_z)) of the centre's. A cell goes only where that whole rectangle and a margin are
+background in several views: a mask that is a little too small, or shifted, or empty in one view, carves nothing away.
+What lies outside of an image counts as background if its silhouette keeps clear of the border, for then the image
+shows the whole object. Carving begins with large cells and splits those that stay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from edge_se_sampler.data.blender import Views
+
+MARGIN = 2
+"""Pixels that a silhouette may be too small, or moved."""
+WITNESSES = 2
+"""Views that must see a cell to be empty, where there are as many."""
+FIRST_CELLS = 16
+"""Cells along the box when carving begins."""
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Cubic cells in a box around the scene."""
+
+    corner: np.ndarray
+    """(3,) float64, world units: where the box has its least coordinates."""
+    side: float
+    """h, world units."""
+    cells: np.ndarray
+    """(X, Y, Z) bool: may hold something."""
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """What one view says of where the object is."""
+
+    count: np.ndarray
+    """(H + 1, W + 1) int32: foreground pixels above and left of a corner."""
+    whole: bool
+    """It keeps clear of the image's border, which therefore shows all of the object."""
+
+    def shows(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """(m,) bool: rectangles of u, v (m, 2) that have foreground in them, or MARGIN pixels around."""
+        height, width = self.count.shape
+        left, top = (np.floor(low).astype(np.int64) - MARGIN).T
+        right, bottom = (np.ceil(high).astype(np.int64) + MARGIN).T
+        left, right = left.clip(0, width - 1), right.clip(0, width - 1)
+        top, bottom = top.clip(0, height - 1), bottom.clip(0, height - 1)
+        corners = self.count[bottom, right] - self.count[top, right] - self.count[bottom, left] + self.count[top, left]
+        return corners > 0
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cube around what all cameras look at."""
+
+    middle: np.ndarray
+    """(3,) float64."""
+    half: float
+    """Half its side, world units."""
+
+
+def box_of(views: Views, near: float, far: float) -> Box:
+    """The cube around the point nearest to all optical axes that reaches as far as sampling does, along every axis.
+
+    Args:
+        near, far: depths between which rays are sampled, world units.
+    """
+    position, ahead = views.camera_to_worlds[:, :, 3], -views.camera_to_worlds[:, :, 2]
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    middle = np.linalg.lstsq(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=None)[0]
+    depth = ((middle - position) * ahead).sum(axis=1)
+    return Box(middle, float(np.maximum(far - depth, depth - near).clip(min=0).max()))
+
+
+def footprint(views: Views, box: Box) -> float:
+    """Median size of a pixel at the box's middle, world units: depth / focal length."""
+    position, ahead = views.camera_to_worlds[:, :, 3], -views.camera_to_worlds[:, :, 2]
+    depth = ((box.middle - position) * ahead).sum(axis=1).clip(min=1e-6)
+    return float(np.median(depth / views.focal.mean(axis=1)))
+
+
+def silhouettes(views: Views) -> dict[int, Silhouette]:
+    """By number, of the views that show both foreground and background."""
+    masks = {i: image[..., 3] > 0 for i, image in enumerate(views.images) if image.shape[2] == 4}
+    return {i: _silhouette(mask) for i, mask in masks.items() if mask.any() and not mask.all()}
+
+
+def _silhouette(mask: np.ndarray) -> Silhouette:
+    inner = mask[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    return Silhouette(cv2.integral(mask.astype(np.uint8)), np.count_nonzero(inner) == np.count_nonzero(mask))
+
+
+def carve(views: Views, shown: dict[int, Silhouette], box: Box, side: float) -> Hull:
+    """The cells of a box that may hold something; without silhouettes, all that views see.
+
+    Args:
+        shown: silhouettes by the number of their view.
+        side: of a cell, world units.
+    """
+    splits = max(0, int(np.ceil(np.log2(2 * box.half / (FIRST_CELLS * side)))))
+    corner = box.middle - side * FIRST_CELLS * 2**splits / 2
+    kept = _grid(FIRST_CELLS)
+    for split in range(splits + 1):
+        if split:
+            kept = (2 * kept[:, None] + _grid(2)).reshape(-1, 3)
+        size = side * 2 ** (splits - split)
+        centers = corner + (kept + 0.5) * size
+        in_box = (np.abs(centers - box.middle) < box.half + size / 2).all(axis=1)
+        kept = kept[in_box][_stays(views, shown, centers[in_box], size)]
+    low, high = kept.min(axis=0), kept.max(axis=0)
+    cells = np.zeros(high - low + 1, dtype=bool)
+    cells[tuple((kept - low).T)] = True
+    return Hull(corner + low * side, side, cells)
+
+
+def _grid(size: int) -> np.ndarray:
+    """All (i, j, k) below a size, (size^3, 3) int64."""
+    return np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side: float) -> np.ndarray:
+    """(m,) bool: cells that some view sees and that too few see to be empty."""
+    empty = np.zeros(len(centers), dtype=np.int32)
+    seen = np.zeros(len(centers), dtype=bool)
+    for number, image in enumerate(views.images):
+        low, high, ahead = projected(views, number, centers, side)
+        size = np.array([image.shape[1], image.shape[0]])
+        seen |= ((high > 0) & (low < size)).all(axis=1) | ~ahead
+        if number in shown:
+            silhouette = shown[number]
+            told = ahead if silhouette.whole else ahead & ((low >= 0) & (high <= size)).all(axis=1)
+            empty += told & ~silhouette.shows(low, high)
+    return seen & (empty < min(WITNESSES, max(1, len(shown))))
+
+
+def projected(views: Views, number: int, centers: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rectangles that cells project into: least and greatest u, v (m, 2), and whether a cell is all in front (m,)."""
+    pose = views.camera_to_worlds[number]
+    x, y, z = ((centers - pose[:, 3]) @ (pose[:, :3] * (1, -1, -1))).T
+    half_x, half_y, half_z = side / 2 * np.abs(pose[:, :3]).sum(axis=0)
+    ahead = z > half_z * (1 + 1e-9)
+    z = np.where(ahead, z, half_z + 1)
+    reach = 1 / (z * (z - half_z))
+    off = np.stack(((half_x * z + np.abs(x) * half_z) * reach, (half_y * z + np.abs(y) * half_z) * reach), axis=1)
+    at = np.stack((x / z, y / z), axis=1) * views.focal[number] + views.principal[number]
+    off = off * views.focal[number]
+    return at - off, at + off, ahead

@@ -1,0 +1,155 @@
+"""The lean model: one small network on features kept where the scene is.
+
+h       side of a cell, world units
+sigma   exp(raw) / h: of its own scale, never 0, so that no network can die
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.encoding import encoded_size, positional_encoding
+from edge_se_sampler.nerf.feature_grid import FeatureGrid
+from edge_se_sampler.nerf.field import initialize_all, linear
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.packed import render_packed, spread, sum_rays, transmittance
+from edge_se_sampler.nerf.ray_model import RayModel
+
+RAYS_PER_CHUNK = 4096
+START = -1.0
+"""Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient."""
+LARGEST = 8.0
+"""Raw density above which a cell is opaque whatever it is."""
+JUDGE_EVERY, JUDGE_FROM = 256, 512
+"""Steps: cells are long enough seen to be judged, and densities have begun to mean something."""
+LEAST_OPACITY = 0.01
+"""Of a cell: below, it is taken to be empty."""
+TRIED_AGAIN = 0.02
+"""Share of the empty cells that are tried again until the next judgement."""
+
+
+class LeanField(nn.Module):
+    """Position, features and direction -> density and colour.
+
+    Args:
+        config: resolved, without None.
+        rng: of the initial weights.
+    """
+
+    def __init__(self, config: LeanModelConfig, rng: np.random.Generator) -> None:
+        super().__init__()
+        self.position_frequencies = config.position_frequencies or 0
+        self.direction_frequencies = config.direction_frequencies or 0
+        width, depth = config.width or 0, config.depth or 0
+        first = encoded_size(3, self.position_frequencies) + config.features
+        self.layers = nn.ModuleList(linear(width if i else first, width) for i in range(depth))
+        self.density = linear(width, 1)
+        self.view = linear(width + encoded_size(3, self.direction_frequencies), width)
+        self.color = linear(width, 3)
+        initialize_all(self, config.initialization, rng)
+
+    def forward(
+        self, positions: Tensor, features: Tensor, directions: Tensor, first: Tensor, ray: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Evaluate packed samples.
+
+        Args:
+            positions: (m, 3), -1 .. 1 along the longest edge of the box.
+            features: (m, F).
+            directions: (n, 3) unit.
+            first, ray: (n,) and (m,) int64, see `Samples`.
+
+        Returns:
+            raw density (m,), colour (m, 3) in [0, 1].
+        """
+        h = torch.cat((positional_encoding(positions, self.position_frequencies), features), dim=1)
+        for layer in self.layers:
+            h = F.relu(layer(h), inplace=True)
+        width = h.shape[1]
+        encoded = positional_encoding(directions, self.direction_frequencies)
+        per_ray = F.linear(encoded, self.view.weight[:, width:], self.view.bias)
+        seen = F.relu(F.linear(h, self.view.weight[:, :width]) + spread(per_ray, first, ray), inplace=True)
+        return self.density(h)[:, 0] + START, torch.sigmoid(self.color(seen))
+
+
+class LeanModel(RayModel):
+    """One network, asked in occupied cells alone. `settle` gives it its cells and features.
+
+    Args:
+        config: resolved, without None.
+        rng: of the initial weights.
+    """
+
+    config: LeanModelConfig
+
+    def __init__(self, config: LeanModelConfig, rng: np.random.Generator) -> None:
+        super().__init__(config)
+        self.fine = LeanField(config, rng)
+        self.features: FeatureGrid | None = None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.fine.density.weight.device
+
+    def chunks(self, rays: int) -> Iterator[slice]:
+        """Rows of that many rays, as many at a time as are worth rendering at once."""
+        return (slice(start, start + RAYS_PER_CHUNK) for start in range(0, rays, RAYS_PER_CHUNK))
+
+    @property
+    def needs_cells(self) -> bool:
+        """Always: it has features in them."""
+        return True
+
+    def settle(self, grid: OccupancyGrid) -> None:
+        """Features at the corners of the grid's cells."""
+        super().settle(grid)
+        self.features = FeatureGrid(grid, self.config.features).to(self.device)
+
+    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """The features learn faster: each sees few samples."""
+        assert self.features is not None
+        return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_rate)]
+
+    def begin_step(self, step: int, seed: int) -> None:
+        """As `RayModel`; now and then, cells that have shown no density are left out."""
+        super().begin_step(step, seed)
+        if self.grid is not None and self._learns_cells and step >= JUDGE_FROM and step % JUDGE_EVERY == 0:
+            again = torch.rand(self.grid.possible.shape, generator=self.random, device=self.device) < TRIED_AGAIN
+            self.grid.judge(-math.log1p(-LEAST_OPACITY) / float(self.grid.side), again)
+
+    @property
+    def _learns_cells(self) -> bool:
+        return self.config.economy == "auto" and self.config.cull_by_density
+
+    def forward(self, rays: RayBundle) -> dict[str, Tensor]:
+        """As `RayModel`."""
+        grid, features = self.grid, self.features
+        assert grid is not None, "settle comes first"
+        assert features is not None
+        side = float(grid.side)
+        step = self.config.step_cells * side
+        samples = grid.march(rays, step, self.uniform(len(rays), 1) if self.training else None)
+        centered = (samples.positions - grid.middle) / grid.reach
+        raw, color = self.fine(centered, features(samples.positions), rays.directions, samples.first, samples.ray)
+        density = torch.exp(raw.clamp(max=LARGEST)) / side
+        if self.training and self._learns_cells:
+            grid.remember(samples, density)
+        rgb, accumulation = render_packed(density, color, step, samples.first, samples.ray)
+        background = self.behind(rays)
+        outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}
+        if not self.training:
+            tau = density * step
+            weight = transmittance(tau, samples.first, samples.ray) * -torch.expm1(-tau)
+            far = self.config.far * rays.metadata["directions_norm"]
+            depth = sum_rays((weight * samples.t)[:, None], samples.first)
+            outputs["depth_fine"] = depth + (1 - accumulation) * far
+        return outputs | {"background": background}

@@ -1,0 +1,140 @@
+"""Which cells of a box are worth asking the network about, and the samples of rays in them, packed.
+
+h      side of a cell, world units
+n      rays
+m      samples, of all rays one after the other; sample i lies on ray ray[i], ascending
+t      distance of a sample from its ray's origin, world units
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.nerf.hull import Hull
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Where n rays are to be evaluated."""
+
+    t: Tensor
+    """(m,)."""
+    ray: Tensor
+    """(m,) int64."""
+    first: Tensor
+    """(n,) int64: sample at which each ray begins."""
+    positions: Tensor
+    """(m, 3) world units."""
+    cell: Tensor
+    """(m,) int64: number of the cell that each lies in."""
+
+
+class OccupancyGrid(nn.Module):
+    """Cells of a box; those outside the hull are empty for ever, those inside as long as no density is seen there.
+
+    Its state has the cells themselves: a checkpoint needs no images to be rendered.
+
+    Args:
+        corner: (3,) world units: where the box has its least coordinates.
+        side: h.
+        possible: (X, Y, Z) bool; the outermost False.
+    """
+
+    corner: Tensor
+    side: Tensor
+    possible: Tensor
+    occupied: Tensor
+    largest: Tensor
+    """(X, Y, Z) density seen in each cell since the last judgement."""
+
+    def __init__(self, corner: Tensor, side: float, possible: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("corner", corner.float())
+        self.register_buffer("side", torch.tensor(side, dtype=torch.float32))
+        self.register_buffer("possible", possible.clone())
+        self.register_buffer("occupied", possible.clone())
+        self.register_buffer("largest", torch.zeros(possible.shape))
+
+    @classmethod
+    def of(cls, hull: Hull) -> OccupancyGrid:
+        """The hull's cells, all occupied, with an empty rim: what rounding puts outside of the box is in none."""
+        return cls(torch.from_numpy(hull.corner - hull.side), hull.side, F.pad(torch.from_numpy(hull.cells), (1,) * 6))
+
+    @property
+    def middle(self) -> Tensor:
+        """(3,) of the box."""
+        return self.corner + self.side * torch.tensor(self.possible.shape, device=self.corner.device) / 2
+
+    @property
+    def reach(self) -> Tensor:
+        """Half the longest edge of the box."""
+        return self.side * max(self.possible.shape) / 2
+
+    def locate(self, positions: Tensor) -> Tensor:
+        """(m, 3) world units -> (m,) int64 number of the cell; the rim's where it is outside of the box."""
+        at = (positions - self.corner) / self.side
+        size = torch.tensor(self.possible.shape, device=at.device)
+        at = torch.minimum(at.floor().long().clamp(min=0), size - 1)
+        return (at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2]
+
+    def contains(self, positions: Tensor) -> Tensor:
+        """(m,) bool: positions (m, 3) in occupied cells."""
+        return self.occupied.reshape(-1)[self.locate(positions)]
+
+    def march(self, rays: RayBundle, step: float, jitter: Tensor | None) -> Samples:
+        """Samples a step apart wherever a ray is in an occupied cell.
+
+        Args:
+            step: world units.
+            jitter: (n, 1) in [0, 1): where in the first step a ray begins; None: in its middle.
+        """
+        begin, end = self._span(rays)
+        longest = float((end - begin).clamp(min=0).max()) if len(rays) else 0.0
+        count = int(np.ceil(longest / step)) + 1
+        t = begin + (torch.arange(count, device=begin.device) + (0.5 if jitter is None else jitter)) * step
+        inside = t < end
+        within = torch.minimum(t, end)  # beyond, cell numbers would mean nothing
+        cell = torch.zeros(t.shape, dtype=torch.int32, device=t.device)
+        origin, direction = (rays.origins - self.corner) / self.side, rays.directions / self.side
+        for axis, size in enumerate(self.possible.shape):
+            at = torch.addcmul(origin[:, axis : axis + 1], within, direction[:, axis : axis + 1])
+            cell = cell * size + at.int().clamp_(0, size - 1)
+        inside &= self.occupied.reshape(-1)[cell]
+        packed = torch.nonzero(inside.reshape(-1))[:, 0]
+        ray = torch.div(packed, count, rounding_mode="floor")
+        number = inside.sum(dim=1)
+        t = t.reshape(-1)[packed]
+        positions = torch.addcmul(rays.origins[ray], t[:, None], rays.directions[ray])
+        return Samples(t, ray, number.cumsum(0) - number, positions, cell.reshape(-1)[packed].long())
+
+    def _span(self, rays: RayBundle) -> tuple[Tensor, Tensor]:
+        """Where rays enter and leave the box, (n, 1) each; the end is not after the beginning for those that miss."""
+        far = self.corner + self.side * torch.tensor(self.possible.shape, device=self.corner.device)
+        inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
+        one, other = (self.corner - rays.origins) * inverse, (far - rays.origins) * inverse
+        begin = torch.minimum(one, other).amax(dim=1, keepdim=True).clamp(min=0)
+        return begin, torch.maximum(one, other).amin(dim=1, keepdim=True)
+
+    @torch.no_grad()
+    def remember(self, samples: Samples, density: Tensor) -> None:
+        """Take note of the densities (m,) that training has seen, the largest of each cell."""
+        self.largest.view(-1).scatter_reduce_(0, samples.cell, density.detach(), "amax")
+
+    @torch.no_grad()
+    def judge(self, empty: float, again: Tensor) -> None:
+        """Occupied are from now on the cells where a density above `empty` was seen since the last judgement, their
+        neighbours, so that a surface may move, and those to be tried again.
+
+        Args:
+            again: (X, Y, Z) bool: cells to be tried whatever was seen.
+        """
+        dense = (self.largest > empty).float()
+        near = F.max_pool3d(dense[None, None], 3, stride=1, padding=1)[0, 0] > 0
+        self.occupied.copy_((near | again) & self.possible)
+        self.largest.zero_()

@@ -1,0 +1,83 @@
+"""Features in between corners, against formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from edge_se_sampler.nerf.feature_grid import FeatureGrid
+from edge_se_sampler.nerf.hull import Hull
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+
+SIDE = 0.5
+
+
+def grid(shown: np.ndarray) -> OccupancyGrid:
+    return OccupancyGrid.of(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown)).double()
+
+
+def inside(shown: np.ndarray, count: int = 300) -> torch.Tensor:
+    """Points in cells."""
+    rng = np.random.default_rng(0)
+    cells = np.argwhere(shown)
+    at = cells[rng.integers(len(cells), size=count)] + rng.random((count, 3))
+    return torch.from_numpy(np.array([-1.0, 0.5, 2.0]) + at * SIDE)
+
+
+def some_cells() -> np.ndarray:
+    return np.random.default_rng(3).random((4, 3, 5)) < 0.4
+
+
+def test_a_corner_is_stored_once_and_only_corners_of_cells() -> None:
+    assert len(FeatureGrid(grid(np.ones((2, 1, 1), dtype=bool)), 3).table) == 12
+    apart = np.zeros((5, 1, 1), dtype=bool)
+    apart[[0, 4]] = True
+    assert len(FeatureGrid(grid(apart), 3).table) == 16
+
+
+def test_what_is_linear_is_exact_in_between() -> None:
+    shown = some_cells()
+    cells = grid(shown)
+    features = FeatureGrid(cells, 4).double()
+    rng = np.random.default_rng(1)
+    slope, offset = torch.from_numpy(rng.normal(size=(3, 4))), torch.from_numpy(rng.normal(size=4))
+    corners = torch.from_numpy(np.argwhere(np.ones([n + 1 for n in cells.possible.shape])))
+    positions = cells.corner + corners * SIDE
+    with torch.no_grad():
+        values = positions @ slope + offset
+        used = torch.zeros(len(corners), dtype=torch.bool)
+        flat = cells.possible
+        for i, j, k in torch.nonzero(flat).tolist():
+            for a in range(8):
+                at = (i + (a >> 2), j + (a >> 1 & 1), k + (a & 1))
+                used[np.ravel_multi_index(at, [n + 1 for n in flat.shape])] = True
+        features.table[features.place[used]] = values[used]
+    points = inside(shown)
+    torch.testing.assert_close(features(points), points @ slope + offset)
+
+
+def test_gradients_of_the_table_against_finite_differences() -> None:
+    shown = some_cells()
+    features = FeatureGrid(grid(shown), 2).double()
+    points = inside(shown, 7)
+    table = torch.randn(features.table.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def of(values: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(features, {"table": values}, (points,))
+
+    assert torch.autograd.gradcheck(of, (table.requires_grad_(),))
+
+
+def test_features_do_not_jump_between_cells() -> None:
+    shown = np.ones((3, 3, 3), dtype=bool)
+    features = FeatureGrid(grid(shown), 5).double()
+    with torch.no_grad():
+        features.table.copy_(torch.randn(features.table.shape, generator=torch.Generator().manual_seed(0)))
+    face = torch.tensor([[-0.5, 0.8, 2.7], [0.0, 1.3, 3.1]], dtype=torch.float64)
+    step = torch.tensor([1e-9, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(features(face - step), features(face + step), rtol=0, atol=1e-6)
+
+
+def test_features_begin_at_nothing() -> None:
+    shown = some_cells()
+    assert not bool(FeatureGrid(grid(shown), 4).double()(inside(shown)).any())

@@ -1,0 +1,258 @@
+"""What alpha says of where a scene can be: nothing that is seen is carved away, whatever a mask has wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from edge_se_sampler.cameras import RayGenerator
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.made.cameras import poses
+from edge_se_sampler.nerf import hull as hull_module
+from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.economy import MOST_CELLS, live_pixels, needs
+from edge_se_sampler.nerf.hull import Box, Hull, box_of, carve, footprint, projected, silhouettes
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+
+VIEWS = 12
+
+
+def rods() -> np.ndarray:
+    """(m, 3) points of thin rods, one of them slanting, and a ball: dense enough to leave no hole at 800 x 800."""
+    along = np.linspace(-1, 1, 6000)[:, None]
+    rod = along * (0.9, 0.3, 0.6)
+    upright = along * (0, 0, 0.8) + (0.3, -0.4, 0)
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(40_000, 3))
+    ball *= 0.25 / np.linalg.norm(ball, axis=1, keepdims=True)
+    return np.concatenate((rod, upright, ball + np.array([-0.3, 0.4, 0.1])))
+
+
+def views_of(points: np.ndarray, size: int = 100, count: int = VIEWS, focal: float = 1.37) -> Views:
+    """Views whose alpha is 255 in every pixel that a point falls into, and 0 elsewhere."""
+    matrices = poses("train", count)
+    images = []
+    for pose in matrices:
+        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+        column, row = (
+            np.floor(c).astype(int) for c in (-x / z * focal * size + size / 2, y / z * focal * size + size / 2)
+        )
+        image = np.zeros((size, size, 4), dtype=np.uint8)
+        inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
+        image[row[inside], column[inside]] = 255
+        images.append(image)
+    return Views(
+        tuple(map(str, range(count))), tuple(images), None, np.stack([pose[:3] for pose in matrices]),
+        np.full((count, 2), focal * size), np.full((count, 2), size / 2),
+    )  # fmt: skip
+
+
+def with_masks(views: Views, change: Callable[[int, np.ndarray], np.ndarray]) -> Views:
+    """The views with other alpha."""
+    images = []
+    for i, image in enumerate(views.images):
+        other = image.copy()
+        other[..., 3] = change(i, image[..., 3])
+        images.append(other)
+    return replace(views, images=tuple(images))
+
+
+def hull_of(views: Views, cell_pixels: float = 1.6) -> Hull:
+    box = box_of(views, 2, 6)
+    return carve(views, silhouettes(views), box, cell_pixels * footprint(views, box))
+
+
+def missed(views: Views, hull: Hull) -> int:
+    """Foreground pixels whose ray meets no cell of the hull."""
+    grid, generator = OccupancyGrid.of(hull), RayGenerator(cameras_of(views))
+    pixels = np.concatenate(
+        [np.insert(np.argwhere(image[..., 3] > 0), 0, i, axis=1) for i, image in enumerate(views.images)]
+    )
+    count = 0
+    for chunk in torch.from_numpy(pixels).split(4096):
+        samples = grid.march(generator(chunk), hull.side / 8, None)
+        count += int((torch.bincount(samples.ray, minlength=len(chunk)) == 0).sum())
+    return count
+
+
+# -- the box, and what a cell covers
+
+
+def test_the_box_is_where_the_cameras_look_and_as_large_as_their_depths() -> None:
+    views = views_of(rods())
+    moved = replace(
+        views, camera_to_worlds=views.camera_to_worlds + np.array([[0, 0, 0, 5], [0, 0, 0, -2], [0, 0, 0, 1]])
+    )
+    box = box_of(moved, 2.5, 6)
+    distance = np.linalg.norm(views.camera_to_worlds[:, :, 3], axis=1)
+    np.testing.assert_allclose(box.middle, (5, -2, 1), atol=1e-9)
+    assert box.half == pytest.approx(max((6 - distance).max(), (distance - 2.5).max()))
+    assert footprint(moved, box) == pytest.approx(np.median(distance) / 137)
+
+
+def test_a_rectangle_holds_all_of_its_cell() -> None:
+    views, rng = views_of(rods()), np.random.default_rng(1)
+    centers, side = rng.uniform(-1.5, 1.5, (500, 3)), 0.4
+    for number in range(VIEWS):
+        low, high, ahead = projected(views, number, centers, side)
+        assert ahead.all()
+        pose = views.camera_to_worlds[number]
+        worst = []
+        for corner in np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3):
+            x, y, z = ((centers + corner * side / 2 - pose[:, 3]) @ pose[:, :3]).T
+            pixel = np.stack((-x / z, y / z), axis=1) * views.focal[number] + views.principal[number]
+            assert (pixel >= low - 1e-9).all()
+            assert (pixel <= high + 1e-9).all()
+            worst.append(np.abs(pixel - (low + high) / 2) / (high - low))
+        assert np.median(np.max(worst, axis=0)) > 0.3  # and is not much larger: 0.5 would touch it
+
+
+def test_a_cell_around_a_camera_is_not_judged_by_it() -> None:
+    views = views_of(rods())
+    _, _, ahead = projected(views, 0, views.camera_to_worlds[:1, :, 3], 0.5)
+    assert not ahead.any()
+
+
+# -- nothing that is seen goes
+
+
+@pytest.mark.parametrize("size", [100, 800])
+def test_no_foreground_pixel_loses_its_cells(size: int) -> None:
+    views = views_of(rods(), size, 12 if size == 100 else 4)
+    hull = hull_of(views, 1.6 if size == 100 else 6)
+    assert missed(views, hull) == 0
+    assert hull.cells.sum() * hull.side**3 < (0.6 if size == 100 else 0.4)  # of 64: rods, a ball, and a margin
+
+
+def eroded(_: int, alpha: np.ndarray) -> np.ndarray:
+    # a rod of one pixel would be gone wholly: what is thick loses its outermost pixel
+    thick = cv2.erode(alpha, np.ones((3, 3), np.uint8))
+    thin = cv2.subtract(alpha, cv2.dilate(thick, np.ones((3, 3), np.uint8)))
+    return cv2.max(thick, thin)
+
+
+def noisy(i: int, alpha: np.ndarray) -> np.ndarray:
+    flipped = np.random.default_rng(i).random(alpha.shape) < 0.02
+    return np.where(flipped, 255 - alpha, alpha)
+
+
+def shifted(i: int, alpha: np.ndarray) -> np.ndarray:
+    return np.roll(alpha, ((-1) ** i, (-1) ** (i // 2)), axis=(0, 1))
+
+
+def empty_in_one(i: int, alpha: np.ndarray) -> np.ndarray:
+    return alpha * (i != 3)
+
+
+def half_in_one(i: int, alpha: np.ndarray) -> np.ndarray:
+    return alpha * (np.arange(len(alpha)) < 50) if i == 3 else alpha
+
+
+DAMAGES: list[Callable[[int, np.ndarray], np.ndarray]] = [eroded, noisy, shifted, empty_in_one, half_in_one]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_wrong_masks_carve_nothing_away(damage: Callable[[int, np.ndarray], np.ndarray]) -> None:
+    views = views_of(rods())
+    wrong = with_masks(views, damage)
+    assert any((one != other).any() for one, other in zip(views.images, wrong.images, strict=True))
+    assert missed(views, hull_of(wrong)) == 0
+
+
+@pytest.mark.parametrize(("damage", "name", "value"), [(shifted, "MARGIN", 0), (half_in_one, "WITNESSES", 1)])
+def test_without_margin_or_witnesses_they_would(
+    damage: Callable[[int, np.ndarray], np.ndarray], name: str, value: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = views_of(rods())
+    monkeypatch.setattr(hull_module, name, value)
+    if name == "MARGIN":  # an empty slice otherwise
+        monkeypatch.setattr(hull_module, "_silhouette", lambda mask: _whole(mask))
+    assert missed(views, hull_of(with_masks(views, damage))) > 0
+
+
+def _whole(mask: np.ndarray) -> Any:
+    return hull_module.Silhouette(cv2.integral(mask.astype(np.uint8)), True)
+
+
+def test_what_an_image_cuts_off_is_kept() -> None:
+    """A long rod leaves every image: the views know nothing of what lies outside."""
+    points = np.linspace(-1, 1, 8000)[:, None] * (0, 0, 1.9)
+    views = views_of(points, focal=2.2)
+    assert not any(shape.whole for shape in silhouettes(views).values())
+    hull = hull_of(views)
+    kept = OccupancyGrid.of(hull).contains(torch.from_numpy(points).float()).numpy()
+    seen = np.zeros(len(points), dtype=bool)
+    for number in range(VIEWS):
+        low, high, _ = projected(views, number, points, 1e-6)
+        seen |= ((low > 0) & (high < 100)).all(axis=1)
+    assert 0.5 < seen.mean() < 1
+    assert kept[seen].all()
+    inside = views_of(points * 0.3, focal=2.2)
+    assert all(shape.whole for shape in silhouettes(inside).values())
+
+
+# -- without alpha, and how much there is
+
+
+@pytest.mark.parametrize("opaque", [True, False])
+def test_without_a_background_all_that_views_see_is_kept(opaque: bool) -> None:
+    views = views_of(rods())
+    images = tuple(image[..., :3] if opaque else np.full_like(image, 255) for image in views.images)
+    plain = replace(views, images=images)
+    told = needs(plain, LeanModelConfig())
+    assert told.silhouettes == 0
+    middle = told.hull.corner + np.array(told.hull.cells.shape) * told.hull.side / 2
+    np.testing.assert_allclose(middle, 0, atol=told.hull.side)
+    grid = OccupancyGrid.of(told.hull)
+    rng = np.random.default_rng(0)
+    assert bool(grid.contains(torch.from_numpy(rng.uniform(-1, 1, (1000, 3))).float()).all())
+    assert told.hull.cells.sum() <= 1.3 * MOST_CELLS
+
+
+def test_a_part_that_is_off_does_not_carve() -> None:
+    views = views_of(rods())
+    carved, whole = (needs(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
+    assert carved.silhouettes == VIEWS
+    assert whole.silhouettes == 0
+    assert carved.hull.cells.sum() * carved.hull.side**3 < 0.02 * whole.hull.cells.sum() * whole.hull.side**3
+    assert needs(views, LeanModelConfig(economy="off")).silhouettes == 0
+
+
+def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:
+    views = views_of(rods())
+    fine = needs(views, LeanModelConfig(cell_pixels=1.6))
+    assert fine.hull.side == pytest.approx(1.6 * fine.footprint)
+    many = needs(views_of(rods(), 800, 4), LeanModelConfig(cell_pixels=0.2))
+    assert many.hull.side > 0.2 * many.footprint
+    assert 0.05 * MOST_CELLS < many.hull.cells.sum() < MOST_CELLS
+
+
+# -- live pixels
+
+
+def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
+    views = views_of(rods())
+    hull = hull_of(views)
+    grid, generator = OccupancyGrid.of(hull), RayGenerator(cameras_of(views))
+    dead = 0
+    for number, live in enumerate(live_pixels(views, hull)):
+        rays = generator.image(number)
+        meets = torch.bincount(grid.march(rays, hull.side / 4, None).ray, minlength=len(rays)).numpy() > 0
+        assert not (meets & ~live.reshape(-1)).any()
+        dead += (live.reshape(-1) & ~meets).mean()
+    assert 0 < dead / VIEWS < 0.1
+
+
+def test_a_camera_inside_of_the_hull_may_train_on_all_its_pixels() -> None:
+    views = views_of(rods())
+    box = Box(np.zeros(3), 2.0)
+    around = Hull(np.full(3, -6.0), 12.0, np.ones((1, 1, 1), dtype=bool))
+    assert all(live.all() for live in live_pixels(views, around))
+    assert box.half == 2

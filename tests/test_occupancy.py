@@ -1,0 +1,128 @@
+"""Cells and the samples of rays in them, against doing it point by point."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tiny import tiny_rays
+from torch import Tensor
+
+from edge_se_sampler.nerf.hull import Hull
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+
+SIDE = 0.25
+
+
+def cells(seed: int = 0, share: float = 0.3) -> np.ndarray:
+    return np.random.default_rng(seed).random((7, 5, 6)) < share
+
+
+def grid_of(shown: np.ndarray) -> OccupancyGrid:
+    middle = np.array(shown.shape) * SIDE / 2
+    return OccupancyGrid.of(Hull(-middle, SIDE, shown)).double()
+
+
+def cell_of(positions: Tensor, shown: np.ndarray) -> np.ndarray:
+    """Whether points are in a cell, one coordinate after the other."""
+    at = np.floor((positions.numpy() + np.array(shown.shape) * SIDE / 2) / SIDE).astype(int)
+    inside = ((at >= 0) & (at < shown.shape)).all(axis=1)
+    found = np.zeros(len(at), dtype=bool)
+    found[inside] = shown[tuple(at[inside].T)]
+    return found
+
+
+def test_a_point_is_where_its_coordinates_say() -> None:
+    shown, rng = cells(), np.random.default_rng(1)
+    positions = torch.from_numpy(rng.uniform(-1.5, 1.5, (5000, 3)))
+    found = grid_of(shown).contains(positions).numpy()
+    assert 0.01 < found.mean() < 0.3
+    np.testing.assert_array_equal(found, cell_of(positions, shown))
+
+
+@pytest.mark.parametrize("jittered", [True, False])
+def test_samples_are_those_of_every_ray_that_lie_in_a_cell(jittered: bool) -> None:
+    shown, rays, step = cells(), tiny_rays(200), 0.11
+    grid = grid_of(shown)
+    jitter = torch.from_numpy(np.random.default_rng(2).random((200, 1))) if jittered else None
+    samples = grid.march(rays, step, jitter)
+    # brute force: the same comb of distances, far beyond the box on both sides
+    begin, _ = grid._span(rays)
+    comb = begin + (torch.arange(100) + (0.5 if jitter is None else jitter)) * step
+    positions = rays.origins[:, None] + comb[..., None] * rays.directions[:, None]
+    inside = cell_of(positions.reshape(-1, 3), shown).reshape(comb.shape)
+    assert 200 < inside.sum() == len(samples.t)
+    torch.testing.assert_close(samples.t, comb[torch.from_numpy(inside)])
+    torch.testing.assert_close(samples.positions, positions[torch.from_numpy(inside)])
+    np.testing.assert_array_equal(samples.ray.numpy(), np.nonzero(inside)[0])
+    np.testing.assert_array_equal(samples.first.numpy(), np.cumsum(inside.sum(1)) - inside.sum(1))
+    assert bool(grid.occupied.reshape(-1)[samples.cell].all())
+    assert torch.equal(samples.cell, grid.locate(samples.positions))
+
+
+def test_no_part_of_a_ray_in_a_cell_is_left_out() -> None:
+    """All cells occupied: as many samples as steps fit between the box's faces."""
+    rays, step = tiny_rays(100), 0.01
+    grid = grid_of(np.ones((7, 5, 6), dtype=bool))
+    grid.occupied.copy_(grid.possible)
+    samples = grid.march(rays, step, None)
+    inverse = 1 / rays.directions
+    half = torch.tensor([7, 5, 6]) * SIDE / 2
+    one, other = (-half - rays.origins) * inverse, (half - rays.origins) * inverse
+    length = (torch.maximum(one, other).amin(1) - torch.minimum(one, other).amax(1)).clamp(min=0)
+    number = torch.bincount(samples.ray, minlength=100)
+    assert bool((number > 0).any())
+    assert float((number * step - length).abs().max()) <= step + 1e-9
+
+
+def test_rays_that_miss_and_no_rays_have_no_samples() -> None:
+    grid, rays = grid_of(cells()), tiny_rays(20)
+    away = type(rays)(rays.origins, -rays.directions, rays.camera_indices, rays.metadata)
+    assert len(grid.march(away, 0.1, None).t) == 0
+    assert len(grid.march(rays[:0], 0.1, None).t) == 0
+
+
+def test_a_direction_along_an_axis_is_no_division_by_zero() -> None:
+    grid, rays = grid_of(np.ones((7, 5, 6), dtype=bool)), tiny_rays(1)
+    along = type(rays)(
+        torch.tensor([[-4.0, 0.1, 0.1]]).double(), torch.tensor([[1.0, 0.0, 0.0]]).double(), rays.camera_indices,
+        rays.metadata,
+    )  # fmt: skip
+    samples = grid.march(along, 0.05, None)
+    assert len(samples.t) == pytest.approx(7 * SIDE / 0.05, abs=1)
+
+
+# -- what training teaches
+
+
+def test_cells_without_density_go_their_neighbours_stay_and_none_outside_the_hull_comes() -> None:
+    shown = np.ones((7, 5, 6), dtype=bool)
+    shown[0] = False
+    grid = grid_of(shown)
+    samples = grid.march(tiny_rays(500), 0.1, None)
+    middle = torch.tensor([[0.0, 0.0, 0.1]], dtype=torch.float64)
+    number = grid.locate(middle)
+    grid.remember(samples, torch.where(samples.cell == number, 5.0, 0.5).double())
+    none = torch.zeros_like(grid.possible)
+    grid.judge(1.0, none)
+    place = np.unravel_index(int(number), grid.possible.shape)
+    expected = torch.zeros_like(grid.possible)
+    expected[tuple(slice(at - 1, at + 2) for at in place)] = True
+    assert torch.equal(grid.occupied, expected & grid.possible)
+    assert not bool(grid.largest.any())  # the next judgement is of what is seen from now on
+
+    again = none.clone()
+    again[2, 1, 1] = again[0, 0, 0] = True
+    grid.judge(1.0, again)
+    assert torch.nonzero(grid.occupied).tolist() == [[2, 1, 1]]  # not the rim's
+
+
+def test_the_largest_density_of_a_cell_counts() -> None:
+    grid = grid_of(np.ones((7, 5, 6), dtype=bool))
+    samples = grid.march(tiny_rays(300), 0.05, None)
+    density = torch.from_numpy(np.random.default_rng(0).random(len(samples.t)))
+    for part in (density, density / 2):
+        grid.remember(samples, part)
+    expected = np.zeros(grid.possible.numel())
+    np.maximum.at(expected, samples.cell.numpy(), density.numpy())
+    np.testing.assert_array_equal(grid.largest.reshape(-1).numpy(), expected)
