@@ -64,7 +64,7 @@ class RayModel(nn.Module, ABC):
 
     def settle(self, grid: OccupancyGrid) -> None:
         """Ask networks only in the grid's cells from now on."""
-        self.grid = grid.to(self.device)
+        self.grid = grid.to(self.device, self.dtype)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
         """As torch's; a state with cells settles the model in them."""

@@ -1,0 +1,258 @@
+"""The lean model: gradients, cells that come and go, its state, and a training from files to a checkpoint and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import tiny_model, tiny_rays
+from torch import Tensor
+
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.made import make_scenes
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import load_model, prepare
+from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.nerf import lean
+from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.hull import Hull
+from edge_se_sampler.nerf.lean import JUDGE_EVERY, JUDGE_FROM, LeanModel
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+
+RAYS = 12
+SIDE = 0.3
+
+
+def ball(radius: float = 1.0) -> Hull:
+    count = 8
+    at = (np.arange(count) + 0.5 - count / 2) * SIDE
+    inside = np.linalg.norm(np.stack(np.meshgrid(at, at, at, indexing="ij")), axis=0) < radius
+    return Hull(np.full(3, -count * SIDE / 2), SIDE, inside)
+
+
+def model_in(hull: Hull, **changes: Any) -> LeanModel:
+    """A tiny one in float64, its features not all 0."""
+    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, features=3), **changes)
+    model = LeanModel(config, np.random.default_rng(0))
+    model.settle(OccupancyGrid.of(hull))
+    model = model.double()
+    assert model.features is not None
+    with torch.no_grad():
+        model.features.table.copy_(torch.from_numpy(np.random.default_rng(1).normal(size=model.features.table.shape)))
+    return model
+
+
+def pixels() -> Tensor:
+    return torch.from_numpy(np.random.default_rng(2).random((RAYS, 4)))
+
+
+def loss_of(model: LeanModel) -> Tensor:
+    model.begin_step(3, 7)
+    return model.training_loss(tiny_rays(RAYS), {"image": pixels()})[0].sum()
+
+
+def test_gradients_of_everything_against_finite_differences() -> None:
+    model = model_in(ball(), background_color="random").train()
+    loss_of(model).backward()
+    rng, h = np.random.default_rng(0), 1e-7
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.any(), name
+        step = torch.from_numpy(rng.normal(size=parameter.shape))
+        analytic = float((parameter.grad * step).sum())
+        with torch.no_grad():
+            values = []
+            for sign in (1, -2):
+                parameter += sign * h * step
+                values.append(float(loss_of(model)))
+            parameter += h * step
+        assert (values[0] - values[1]) / (2 * h) == pytest.approx(analytic, rel=1e-4, abs=1e-7), name
+
+
+def test_culled_rendering_equals_rendering_everything_with_nothing_outside() -> None:
+    """The same samples in a box that is wholly occupied, their density set to 0 outside of the ball."""
+    hull = ball()
+    culled = model_in(hull).eval()
+    whole = model_in(Hull(hull.corner, SIDE, np.ones_like(hull.cells))).eval()
+    whole.fine.load_state_dict(culled.fine.state_dict())
+    one, other = culled.features, whole.features
+    assert one is not None
+    assert other is not None
+    corners = torch.nonzero(torch.ones([n + 1 for n in culled.grid.possible.shape]))  # of the padded box, in both
+    with torch.no_grad():
+        other.table[other.place] = one.table[one.place]
+    inside = culled.grid.contains
+    field = whole.fine.forward
+
+    def masked(positions: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
+        raw, color = field(positions, *others)
+        world = positions * whole.grid.reach + whole.grid.middle
+        return torch.where(inside(world), raw, -torch.inf), color
+
+    whole.fine.forward = masked
+    rays = tiny_rays(RAYS)
+    # both march from where the same box begins
+    whole.grid.corner.copy_(culled.grid.corner)
+    shown, expected = culled(rays), whole(rays)
+    assert len(corners) > 0
+    assert 0.01 < float(shown["accumulation_fine"].detach().mean()) < 0.99
+    for key in ("rgb_fine", "accumulation_fine", "depth_fine"):
+        torch.testing.assert_close(shown[key], expected[key], rtol=0, atol=1e-9)
+
+
+def test_rays_beside_the_scene_show_the_background_and_teach_nothing() -> None:
+    model = model_in(ball(0.3)).train()
+    rays = tiny_rays(RAYS)
+    away = type(rays)(rays.origins, -rays.directions, rays.camera_indices, rays.metadata)
+    error, _ = model.training_loss(away, {"image": pixels()})
+    error.sum().backward()
+    assert bool((model.eval()(away)["rgb_fine"] == 1).all())
+    assert all(weight.grad is None or not weight.grad.any() for weight in model.parameters())
+
+
+# -- cells that come and go
+
+
+def judged(model: LeanModel, step: int) -> int:
+    model.begin_step(step, step + 1)
+    return int(model.grid.occupied.sum())
+
+
+def test_empty_cells_go_and_some_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lean, "START", -20.0)  # nothing anywhere
+    model = model_in(ball()).train()
+    before = int(model.grid.occupied.sum())
+    model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
+    assert judged(model, JUDGE_FROM - JUDGE_EVERY) == before  # too early
+    assert judged(model, JUDGE_FROM + 1) == before  # not the time
+    first = judged(model, JUDGE_FROM)
+    assert 0 < first < 0.1 * before  # a fiftieth on average
+    again = model.grid.occupied.clone()
+    judged(model, JUDGE_FROM + JUDGE_EVERY)
+    assert not torch.equal(again, model.grid.occupied)  # others
+
+
+def test_a_dense_cell_stays() -> None:
+    model = model_in(ball()).train()
+    before = int(model.grid.occupied.sum())
+    for seed in range(3):
+        rays = tiny_rays(2000, seed)
+        model.training_loss(rays, {"image": torch.ones(2000, 3).double()})
+    assert judged(model, JUDGE_FROM) > 0.95 * before
+
+
+@pytest.mark.parametrize("off", [{"cull_by_density": False}, {"economy": "off"}])
+def test_a_part_that_is_off_judges_nothing(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lean, "START", -20.0)
+    model = model_in(ball(), **off).train()
+    before = int(model.grid.occupied.sum())
+    model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
+    assert not bool(model.grid.largest.any())
+    assert judged(model, JUDGE_FROM) == before
+
+
+def test_judgements_are_a_function_of_the_seed() -> None:
+    one, other = (model_in(ball()) for _ in range(2))
+    for model in (one, other):
+        torch.rand(3)  # the global generator is nobody's
+        model.begin_step(JUDGE_FROM, 11)
+    assert torch.equal(one.grid.occupied, other.grid.occupied)
+
+
+# -- state
+
+
+def test_a_state_brings_its_cells() -> None:
+    model = model_in(ball())
+    model.grid.occupied[3] = False
+    fresh = LeanModel(model.config, np.random.default_rng(5)).double()
+    fresh.load_state_dict(model.state_dict())
+    rays = tiny_rays(RAYS)
+    assert torch.equal(fresh.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
+    assert torch.equal(fresh.grid.occupied, model.grid.occupied)
+
+
+def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() -> None:
+    dense, settled = (tiny_model(density_activation="softplus").eval() for _ in range(2))
+    settled.settle(OccupancyGrid.of(Hull(np.full(3, -9.0), 1.0, np.ones((18, 18, 18), dtype=bool))))
+    rays = tiny_rays(RAYS)
+    for key, value in dense(rays).items():
+        torch.testing.assert_close(settled(rays)[key], value, rtol=0, atol=1e-12)
+    fresh = tiny_model(seed=4, density_activation="softplus").eval()
+    fresh.load_state_dict(settled.state_dict())
+    assert torch.equal(fresh(rays)["rgb_fine"], settled(rays)["rgb_fine"])
+    settled.settle(OccupancyGrid.of(Hull(np.full(3, -0.3), 0.2, np.ones((3, 3, 3), dtype=bool))))
+    assert float((settled(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).abs().max()) > 1e-3
+
+
+# -- from files
+
+
+@pytest.fixture
+def larger(tmp_path: Path) -> Path:
+    """A scene of enough views and pixels to know where the object is not."""
+    return make_scenes(tmp_path / "made", ["mic"], size=48, num_train=6, num_val=1, num_test=1)[0]
+
+
+def lean_config(scene: Path, place: Path, **model: Any) -> TrainerConfig:
+    config: TrainerConfig = registered_methods()["lean-nerf"].specification.config
+    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=128)
+    pipeline = replace(config.pipeline, datamanager=manager, model=replace(config.pipeline.model, **model))
+    machine = replace(config.machine, device_type="cpu")
+    return replace(config, data=scene, output_dir=place, max_num_iterations=120, pipeline=pipeline, machine=machine)
+
+
+def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(larger: Path, tmp_path: Path) -> None:
+    trainer = prepare(lean_config(larger, tmp_path))
+    model = trainer.pipeline.model
+    views = trainer.pipeline.datamanager
+    assert not bool(views.image_batch["mask"].all())  # live pixels alone
+    trainer.train()
+    picture = pictures_of(read_blender(larger, "test"))[0]
+    _, psnr = render_view(model, picture)
+    away = picture.image[..., 3:] * (1 - picture.image[..., :3])
+    background = -10 * np.log10(np.mean(away.astype(np.float64) ** 2))
+    assert 5 < background < 30
+    assert psnr > background + 3
+    _, again, _ = load_model(RunFolder(trainer.run.path))
+    rays = picture.rays(model.device)
+    assert torch.equal(render_rays(again, rays), render_rays(model, rays))
+
+
+def test_without_alpha_it_trains_on_all_pixels(larger: Path, tmp_path: Path) -> None:
+    trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
+    assert len(trainer.pipeline.model.features.table) > 50_000
+    assert trainer.pipeline.datamanager.image_batch["mask"].float().mean() > 0.9
+    loss = [trainer.train_iteration(step) for step in range(3)]
+    assert all(np.isfinite(loss))
+
+
+def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_se: Any) -> None:
+    flags = ["train", "lean-nerf", "--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "3"]
+    for flag, value, word in (
+        ("--pipeline.model.cell-pixels", "0", "cell-pixels is 0.0"),
+        ("--pipeline.model.step-cells", "nan", "step-cells is nan"),
+        ("--pipeline.model.features", "0", "features is 0"),
+        ("--pipeline.datamanager.pixel-sampler.se-scoring", "coarse", "no coarse network"),
+    ):
+        answer = edge_se(*flags, flag, value)
+        assert answer.code == 2, (flag, answer)
+        assert word in answer.err
+        assert answer.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_from_the_command_line(scene: Path, tmp_path: Path, edge_se: Any) -> None:
+    flags = ["--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "8"]
+    assert edge_se("train", "lean-nerf", *flags).code == 0
+    (run,) = (tmp_path / "out").glob("*/lean-nerf/*")
+    answer = edge_se("eval", run, "--output-path", tmp_path / "eval.json")
+    assert answer.code == 0, answer
+    assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "lean-nerf"
