@@ -17,6 +17,7 @@ import tyro
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.nerf.config import LeanModelConfig
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 
 
@@ -208,6 +209,37 @@ class Show:
 
 
 @dataclass(frozen=True)
+class Inspect:
+    """What a scene needs, derived from its cameras and its alpha, as economy auto does: numbers and a picture."""
+
+    data: Path
+    """A Blender folder."""
+    output_path: Path = Path("inspect.png")
+    """The picture to write."""
+    near: float = LeanModelConfig.near
+    """Depth along the optical axis at which samples begin, world units."""
+    far: float = LeanModelConfig.far
+    """Depth at which samples end."""
+    cell_pixels: float = LeanModelConfig.cell_pixels
+    """Side of a cell, in pixels' footprints."""
+    step_cells: float = LeanModelConfig.step_cells
+    """Distance between samples, in sides of a cell."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.engine.inspection import inspect
+
+        if not 0 <= self.near < self.far < float("inf"):
+            raise InputError(f"--near is {self.near}, --far {self.far}: 0 <= near < far")
+        for flag, value in (("cell-pixels", self.cell_pixels), ("step-cells", self.step_cells)):
+            if not 0 < value < float("inf"):
+                raise InputError(f"--{flag} is {value}: must be above 0")
+        asked = LeanModelConfig(near=self.near, far=self.far, cell_pixels=self.cell_pixels, step_cells=self.step_cells)
+        print(inspect(read_blender(self.data, "train"), asked, self.output_path))
+        print(self.output_path)
+
+
+@dataclass(frozen=True)
 class Methods:
     """List every method and where it comes from."""
 
@@ -230,6 +262,7 @@ COMMANDS: dict[str, type] = {
     "eval": Eval,
     "render": Render,
     "show": Show,
+    "inspect": Inspect,
     "methods": Methods,
     "bench": Bench,
 }

@@ -140,14 +140,16 @@ def test_remembered_errors_rank_as_true_ones_do() -> None:
     trained(sampler, host, range(LATE, LATE + 80))
     every = {"indices": torch.cat([address.reshape(-1, 3) for address in host["address"]])}
     true = brightness({"image": host["image"].reshape(-1, 3)})
+    assert sampler.memory is not None
     told = sampler.memory.recall(every["indices"].numpy(), LATE + 80, 40)
-    ranks = [np.argsort(np.argsort(values)) for values in (told, true.numpy())]
-    assert np.corrcoef(*ranks)[0, 1] > 0.9
+    ranks = np.stack([np.argsort(np.argsort(values)) for values in (told, true.numpy())])
+    assert np.corrcoef(ranks)[0, 1] > 0.9
 
 
 def test_the_early_phase_fills_the_memory() -> None:
     sampler = following(0, se_scoring="memory", squared_error=never)
     trained(sampler, batch_of(), range(5))
+    assert sampler.memory is not None
     assert np.count_nonzero(sampler.memory.seen) > 50
 
 
@@ -175,6 +177,7 @@ def test_the_watch_hears_of_uniform_pixels_though_only_the_wrong_ones_are_traine
     monkeypatch.setattr(Watch, "observe", lambda self, *told: said.append(told[3]))
     host = batch_of(channels=4)
     sampler = following(LATE, rays=60, schedule="auto", se_scoring="memory", squared_error=never, images_per_step="all")
+    assert sampler.watch is not None
     sampler.watch.phase = "late"
     trained(sampler, host, range(40))
     said.clear()

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -22,9 +23,11 @@ from edge_se_sampler.engine.session import load_model, prepare
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf import lean
 from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.economy import live_pixels, needs
 from edge_se_sampler.nerf.hull import Hull
 from edge_se_sampler.nerf.lean import JUDGE_EVERY, JUDGE_FROM, LeanModel
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.ray_model import RayModel
 
 RAYS = 12
 SIDE = 0.3
@@ -47,6 +50,11 @@ def model_in(hull: Hull, **changes: Any) -> LeanModel:
     with torch.no_grad():
         model.features.table.copy_(torch.from_numpy(np.random.default_rng(1).normal(size=model.features.table.shape)))
     return model
+
+
+def cells(model: RayModel) -> OccupancyGrid:
+    assert model.grid is not None
+    return model.grid
 
 
 def pixels() -> Tensor:
@@ -76,7 +84,9 @@ def test_gradients_of_everything_against_finite_differences() -> None:
         assert (values[0] - values[1]) / (2 * h) == pytest.approx(analytic, rel=1e-4, abs=1e-7), name
 
 
-def test_culled_rendering_equals_rendering_everything_with_nothing_outside() -> None:
+def test_culled_rendering_equals_rendering_everything_with_nothing_outside(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The same samples in a box that is wholly occupied, their density set to 0 outside of the ball."""
     hull = ball()
     culled = model_in(hull).eval()
@@ -85,23 +95,21 @@ def test_culled_rendering_equals_rendering_everything_with_nothing_outside() -> 
     one, other = culled.features, whole.features
     assert one is not None
     assert other is not None
-    corners = torch.nonzero(torch.ones([n + 1 for n in culled.grid.possible.shape]))  # of the padded box, in both
     with torch.no_grad():
         other.table[other.place] = one.table[one.place]
-    inside = culled.grid.contains
+    inside = cells(culled).contains
     field = whole.fine.forward
 
     def masked(positions: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
         raw, color = field(positions, *others)
-        world = positions * whole.grid.reach + whole.grid.middle
+        world = positions * cells(whole).reach + cells(whole).middle
         return torch.where(inside(world), raw, -torch.inf), color
 
-    whole.fine.forward = masked
+    monkeypatch.setattr(whole.fine, "forward", masked)
     rays = tiny_rays(RAYS)
     # both march from where the same box begins
-    whole.grid.corner.copy_(culled.grid.corner)
+    cells(whole).corner.copy_(cells(culled).corner)
     shown, expected = culled(rays), whole(rays)
-    assert len(corners) > 0
     assert 0.01 < float(shown["accumulation_fine"].detach().mean()) < 0.99
     for key in ("rgb_fine", "accumulation_fine", "depth_fine"):
         torch.testing.assert_close(shown[key], expected[key], rtol=0, atol=1e-9)
@@ -122,26 +130,26 @@ def test_rays_beside_the_scene_show_the_background_and_teach_nothing() -> None:
 
 def judged(model: LeanModel, step: int) -> int:
     model.begin_step(step, step + 1)
-    return int(model.grid.occupied.sum())
+    return int(cells(model).occupied.sum())
 
 
 def test_empty_cells_go_and_some_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean, "START", -20.0)  # nothing anywhere
     model = model_in(ball()).train()
-    before = int(model.grid.occupied.sum())
+    before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
     assert judged(model, JUDGE_FROM - JUDGE_EVERY) == before  # too early
     assert judged(model, JUDGE_FROM + 1) == before  # not the time
     first = judged(model, JUDGE_FROM)
     assert 0 < first < 0.1 * before  # a fiftieth on average
-    again = model.grid.occupied.clone()
+    again = cells(model).occupied.clone()
     judged(model, JUDGE_FROM + JUDGE_EVERY)
-    assert not torch.equal(again, model.grid.occupied)  # others
+    assert not torch.equal(again, cells(model).occupied)  # others
 
 
 def test_a_dense_cell_stays() -> None:
     model = model_in(ball()).train()
-    before = int(model.grid.occupied.sum())
+    before = int(cells(model).occupied.sum())
     for seed in range(3):
         rays = tiny_rays(2000, seed)
         model.training_loss(rays, {"image": torch.ones(2000, 3).double()})
@@ -152,9 +160,9 @@ def test_a_dense_cell_stays() -> None:
 def test_a_part_that_is_off_judges_nothing(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean, "START", -20.0)
     model = model_in(ball(), **off).train()
-    before = int(model.grid.occupied.sum())
+    before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert not bool(model.grid.largest.any())
+    assert not bool(cells(model).largest.any())
     assert judged(model, JUDGE_FROM) == before
 
 
@@ -163,7 +171,7 @@ def test_judgements_are_a_function_of_the_seed() -> None:
     for model in (one, other):
         torch.rand(3)  # the global generator is nobody's
         model.begin_step(JUDGE_FROM, 11)
-    assert torch.equal(one.grid.occupied, other.grid.occupied)
+    assert torch.equal(cells(one).occupied, cells(other).occupied)
 
 
 # -- state
@@ -171,12 +179,12 @@ def test_judgements_are_a_function_of_the_seed() -> None:
 
 def test_a_state_brings_its_cells() -> None:
     model = model_in(ball())
-    model.grid.occupied[3] = False
+    cells(model).occupied[3] = False
     fresh = LeanModel(model.config, np.random.default_rng(5)).double()
     fresh.load_state_dict(model.state_dict())
     rays = tiny_rays(RAYS)
     assert torch.equal(fresh.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
-    assert torch.equal(fresh.grid.occupied, model.grid.occupied)
+    assert torch.equal(cells(fresh).occupied, cells(model).occupied)
 
 
 def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() -> None:
@@ -189,7 +197,7 @@ def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() ->
     fresh.load_state_dict(settled.state_dict())
     assert torch.equal(fresh(rays)["rgb_fine"], settled(rays)["rgb_fine"])
     settled.settle(OccupancyGrid.of(Hull(np.full(3, -0.3), 0.2, np.ones((3, 3, 3), dtype=bool))))
-    assert float((settled(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).abs().max()) > 1e-3
+    assert float((settled(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).detach().abs().max()) > 1e-3
 
 
 # -- from files
@@ -256,3 +264,18 @@ def test_from_the_command_line(scene: Path, tmp_path: Path, edge_se: Any) -> Non
     answer = edge_se("eval", run, "--output-path", tmp_path / "eval.json")
     assert answer.code == 0, answer
     assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "lean-nerf"
+
+
+def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: Any) -> None:
+    answer = edge_se("inspect", "--data", larger, "--output-path", tmp_path / "inspect.png")
+    assert answer.code == 0, answer
+    said = dict(line.split(maxsplit=1) for line in answer.out.splitlines()[:-1])
+    told = needs(read_blender(larger, "train"), LeanModelConfig())
+    assert f"{told.hull.cells.sum():,} of" in said["cells"]
+    assert said["silhouettes"].startswith("6 of 6 views")
+    assert said["pixel"].startswith(f"{told.footprint:.4f}")
+    live = live_pixels(read_blender(larger, "train"), told.hull)
+    assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
+    assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
+    for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf")):
+        assert edge_se("inspect", "--data", larger, flag, value).code == 2

@@ -24,16 +24,23 @@ from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import prepare, prepare_resume
 from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.nerf import lean
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
-what, place, data, interrupt_at = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])
+what, place, data, interrupt_at, method = sys.argv[1:]
+place, data, interrupt_at = Path(place), Path(data), int(interrupt_at)
+lean.JUDGE_FROM = lean.JUDGE_EVERY = 5
 if what == "resume":
     trainer = prepare_resume(RunFolder(place))
 else:
-    config = registered_methods()["edge-se-nerf"].specification.config
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.7)
+    config = registered_methods()[method].specification.config
+    changes = {"early_fraction": 0.7}
+    samples = {"num_coarse_samples": 8, "num_importance_samples": 8, "density_noise": 0.1}
+    if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered
+        changes, samples = {"early": "edge", "late": "se", "se_scoring": "memory", "early_fraction": 0.3}, {}
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, **changes)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
-    model = replace(config.pipeline.model, num_coarse_samples=8, num_importance_samples=8, density_noise=0.1)
+    model = replace(config.pipeline.model, **samples)
     trainer = prepare(replace(
         config, data=data, output_dir=place, max_num_iterations=20, steps_per_log=3, steps_per_eval_image=5,
         machine=MachineConfig(seed=3, device_type="cpu"),
@@ -57,8 +64,8 @@ print(json.dumps({"run": str(trainer.run.path), "pixels": pixels}))
 """
 
 
-def session(what: str, place: Path, scene: Path, interrupt_at: int = -1) -> dict:
-    command = [sys.executable, "-c", SESSION, what, str(place), str(scene), str(interrupt_at)]
+def session(what: str, place: Path, scene: Path, interrupt_at: int = -1, method: str = "edge-se-nerf") -> dict:
+    command = [sys.executable, "-c", SESSION, what, str(place), str(scene), str(interrupt_at), method]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
@@ -84,10 +91,17 @@ def state(run: Path) -> dict[str, bytes | float | str]:
     return flat
 
 
-@pytest.mark.parametrize("interrupt_at", [8, pytest.param(16, marks=pytest.mark.slow)])  # in the edge, in the SE phase
-def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, interrupt_at: int):
-    whole = session("train", tmp_path / "whole", scene)
-    first = session("train", tmp_path / "parts", scene, interrupt_at)
+@pytest.mark.parametrize(
+    ("method", "interrupt_at"),
+    [
+        ("edge-se-nerf", 8),  # in the edge phase
+        pytest.param("edge-se-nerf", 16, marks=pytest.mark.slow),  # in the SE phase
+        ("lean-nerf", 12),
+    ],
+)
+def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, interrupt_at: int):
+    whole = session("train", tmp_path / "whole", scene, method=method)
+    first = session("train", tmp_path / "parts", scene, interrupt_at, method)
     run = Path(first["run"])
     assert [step for step, _ in first["pixels"]] == list(range(interrupt_at + 1))
     assert latest_checkpoint(run / "checkpoints").name == f"step-{interrupt_at:09d}.ckpt"

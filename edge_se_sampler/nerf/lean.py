@@ -112,7 +112,7 @@ class LeanModel(RayModel):
     def settle(self, grid: OccupancyGrid) -> None:
         """Features at the corners of the grid's cells."""
         super().settle(grid)
-        self.features = FeatureGrid(self.grid, self.config.features).to(self.device, self.dtype)
+        self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """The features learn faster: each sees few samples."""
