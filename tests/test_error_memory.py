@@ -143,7 +143,7 @@ def test_remembered_errors_rank_as_true_ones_do() -> None:
     assert sampler.memory is not None
     told = sampler.memory.recall(every["indices"].numpy(), LATE + 80, 40)
     ranks = np.stack([np.argsort(np.argsort(values)) for values in (told, true.numpy())])
-    assert np.corrcoef(ranks)[0, 1] > 0.9
+    assert float(np.corrcoef(ranks).min()) > 0.9
 
 
 def test_the_early_phase_fills_the_memory() -> None:
