@@ -156,6 +156,17 @@ def test_a_dense_cell_stays() -> None:
     assert judged(model, JUDGE_FROM) > 0.95 * before
 
 
+def test_without_features_there_is_the_network_alone() -> None:
+    config = LeanModelConfig("tiny", 8, 2, 2, 1, features=0)
+    model = LeanModel(config, np.random.default_rng(0))
+    model.settle(OccupancyGrid.of(ball()))
+    ((weights, rate),) = model.parameter_groups()
+    assert rate == 1
+    assert len(weights) == len(list(model.fine.parameters())) == len(list(model.parameters()))
+    loss_of(model.double().train()).backward()
+    assert model.fine.layers[0].weight.grad.any()  # pyright: ignore
+
+
 @pytest.mark.parametrize("off", [{"cull_by_density": False}, {"economy": "off"}])
 def test_a_part_that_is_off_judges_nothing(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean, "START", -20.0)
@@ -247,7 +258,7 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
     for flag, value, word in (
         ("--pipeline.model.cell-pixels", "0", "cell-pixels is 0.0"),
         ("--pipeline.model.step-cells", "nan", "step-cells is nan"),
-        ("--pipeline.model.features", "0", "features is 0"),
+        ("--pipeline.model.features", "-1", "features is -1"),
         ("--pipeline.datamanager.pixel-sampler.se-scoring", "coarse", "no coarse network"),
     ):
         answer = edge_se(*flags, flag, value)

@@ -61,8 +61,6 @@ def _check(plan: TrainerConfig) -> None:
     }
     if isinstance(model, NeRFModelConfig):
         at_least_one["pipeline.model.num-importance-samples"] = model.num_importance_samples
-    if isinstance(model, LeanModelConfig):
-        at_least_one["pipeline.model.features"] = model.features
     for flag, value in at_least_one.items():
         if value is None or value < 1:
             raise InputError(f"--{flag} is {value}: must be at least 1")
@@ -104,6 +102,8 @@ def _check_nerf(model: NeRFModelConfig) -> None:
 
 
 def _check_lean(plan: TrainerConfig, model: LeanModelConfig) -> None:
+    if model.features < 0:
+        raise InputError(f"--pipeline.model.features is {model.features}: must be at least 0")
     for flag, value in {"step-cells": model.step_cells, "feature-rate": model.feature_rate}.items():
         if not 0 < value < float("inf"):
             raise InputError(f"--pipeline.model.{flag} is {value}: must be above 0")

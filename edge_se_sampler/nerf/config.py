@@ -68,7 +68,7 @@ class LeanModelConfig(ModelConfig):
     step_cells: float = 1.0
     """Distance between samples, in sides of a cell."""
     features: int = 8
-    """Numbers kept at each corner of a cell."""
+    """Numbers kept at each corner of a cell; 0: the network alone has to know the scene."""
     feature_rate: float = 10.0
     """Learning rate of the features, in the network's."""
 

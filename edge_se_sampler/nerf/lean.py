@@ -94,6 +94,7 @@ class LeanModel(RayModel):
         super().__init__(config)
         self.fine = LeanField(config, rng)
         self.features: FeatureGrid | None = None
+        """None where the network is to do without."""
 
     @property
     def device(self) -> torch.device:
@@ -112,11 +113,13 @@ class LeanModel(RayModel):
     def settle(self, grid: OccupancyGrid) -> None:
         """Features at the corners of the grid's cells."""
         super().settle(grid)
-        self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
+        if self.config.features:
+            self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """The features learn faster: each sees few samples."""
-        assert self.features is not None
+        if self.features is None:
+            return super().parameter_groups()
         return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_rate)]
 
     def begin_step(self, step: int, seed: int) -> None:
@@ -132,14 +135,15 @@ class LeanModel(RayModel):
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`."""
-        grid, features = self.grid, self.features
+        grid = self.grid
         assert grid is not None, "settle comes first"
-        assert features is not None
         side = float(grid.side)
         step = self.config.step_cells * side
         samples = grid.march(rays, step, self.uniform(len(rays), 1) if self.training else None)
-        centered = (samples.positions - grid.middle) / grid.reach
-        raw, color = self.fine(centered, features(samples.positions), rays.directions, samples.first, samples.ray)
+        positions = samples.positions
+        features = positions[:, :0] if self.features is None else self.features(positions)
+        centered = (positions - grid.middle) / grid.reach
+        raw, color = self.fine(centered, features, rays.directions, samples.first, samples.ray)
         density = torch.exp(raw.clamp(max=LARGEST)) / side
         if self.training and self._learns_cells:
             grid.remember(samples, density)
