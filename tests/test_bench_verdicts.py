@@ -157,15 +157,20 @@ def test_the_tables_tell_mean_deviation_and_failures() -> None:
 
     runs = [run("vanilla-nerf", 0, 20.0, "background"), run("vanilla-nerf", 1, 24.0), run("edge-nerf", 0, 30.0)]
     text = markdown(runs, [])
-    assert "| Random | 22.00 ± 2.83 ✗1/2 <sub>13.12</sub> |" in text
+    assert "| Random | 20.00 ✗1/1 <sub>13.12</sub> |" in text  # seed 1 only one of them has
     assert "| Edge | 30.00 <sub>29.38</sub> |" in text
     assert "Table 1" not in text
     assert "Precrop" not in text
+    runs += [run("edge-nerf", 1, 31.0)]
+    text = markdown(runs, [])
+    assert "| Random | 22.00 ± 2.83 ✗1/2 <sub>13.12</sub> |" in text
+    assert "| Edge | 30.50 ± 0.71 <sub>29.38</sub> |" in text
+    assert "| Random | 24.00 <sub>13.12</sub> |" in markdown(runs[1:2] + runs[2:3], [])  # none in common: what there is
     runs += [run("edge-nerf", 0, 20.0, scene="chair"), run("edge-nerf", 1, 22.0, scene="chair")]
     (table,) = rows_of(runs)
     chair, mic, mean = table.rows[1][1]
     assert chair is not None
     assert mic is not None
     assert mean is not None
-    assert (chair.psnr, mic.psnr, mean.psnr) == (21.0, 30.0, 25.5)  # of scenes, not of runs
+    assert (chair.psnr, mic.psnr, mean.psnr) == (21.0, 30.5, 25.75)  # of scenes, not of runs
     assert mean.deviation is None

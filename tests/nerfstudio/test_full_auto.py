@@ -69,7 +69,7 @@ def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
     observe, share = sampler.observe, 1.0
 
     def as_if(errors: torch.Tensor) -> None:
-        image, numbers = (sampler.trained_on[key].numpy() for key in ("image", "numbers"))
+        image, numbers = sampler.trained_on["image"].numpy(), sampler.trained_on["indices"][:, 0].numpy()
         distance = sampler._backgrounds.squared_distance(image, numbers, sampler.background)
         observe(torch.full((len(image),), share * float(distance.mean())))  # alike, so that edges do not pay
 
@@ -106,3 +106,22 @@ def test_what_no_sampler_can_help_is_told_once(host_scene: Path, tmp_path: Path,
     trainer.pipeline.datamanager.train_pixel_sampler.watch.observations = HOPELESS_AFTER - 2
     train(trainer, 5)
     assert capfd.readouterr().err.count("nothing of the object is learnt") == 1
+
+
+def test_remembered_errors_are_those_of_training_and_nobody_renders_candidates(
+    host_scene: Path, tmp_path: Path
+) -> None:
+    config = config_of("edge-se-nerf", host_scene, tmp_path)
+    config.pipeline.datamanager.pixel_sampler.se_scoring = "memory"
+    trainer = trainer_of(config)
+    sampler = trainer.pipeline.datamanager.train_pixel_sampler
+    told, seen = observed(trainer), watch(sampler)
+    rendered = []
+    trainer.pipeline.model.register_forward_hook(lambda *_: rendered.append(1))
+    train(trainer, 8)
+    assert {strategy for _, strategy, _ in seen} == {"edge", "se"}
+    assert len(told) == len(rendered) == 8  # one rendering a step, of what is trained on
+    assert sampler.memory.seen.max() == 8
+    values = sampler.memory.values[sampler.memory.seen > 0]
+    assert float(values.min()) >= 0
+    assert values.std() > 0
