@@ -66,7 +66,9 @@ def with_masks(views: Views, change: Callable[[int, np.ndarray], np.ndarray]) ->
 
 def hull_of(views: Views, cell_pixels: float = 1.6) -> Hull:
     box = box_of(views, 2, 6)
-    return carve(views, silhouettes(views), box, cell_pixels * footprint(views, box))
+    hull = carve(views, silhouettes(views), box, cell_pixels * footprint(views, box))
+    assert hull is not None
+    return hull
 
 
 def missed(views: Views, hull: Hull) -> int:
@@ -223,6 +225,20 @@ def test_a_part_that_is_off_does_not_carve() -> None:
     assert whole.silhouettes == 0
     assert carved.hull.cells.sum() * carved.hull.side**3 < 0.02 * whole.hull.cells.sum() * whole.hull.side**3
     assert needs(views, LeanModelConfig(economy="off")).silhouettes == 0
+
+
+@pytest.mark.parametrize("apart", [0, 30])
+def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.CaptureFixture[str]) -> None:
+    """Another object in every view, or each view's masks somewhere else: nothing, or little, is left of a hull."""
+    views = views_of(rods())
+
+    def moved(i: int, alpha: np.ndarray) -> np.ndarray:
+        return np.roll(alpha, (apart * (-1) ** i, apart * (-1) ** (i // 2)), axis=(0, 1))
+
+    told = needs(with_masks(views, moved), LeanModelConfig())
+    assert (told.silhouettes == 0) == bool(apart)
+    assert capfd.readouterr().err.count("do not agree") == bool(apart)
+    assert missed(views, told.hull) == 0
 
 
 def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:

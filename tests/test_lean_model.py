@@ -248,7 +248,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
 def test_without_alpha_it_trains_on_all_pixels(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
     assert len(trainer.pipeline.model.features.table) > 50_000
-    assert trainer.pipeline.datamanager.image_batch["mask"].float().mean() > 0.9
+    assert "mask" not in trainer.pipeline.datamanager.image_batch
     loss = [trainer.train_iteration(step) for step in range(3)]
     assert all(np.isfinite(loss))
 
@@ -265,6 +265,10 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
         assert answer.code == 2, (flag, answer)
         assert word in answer.err
         assert answer.err.count("\n") == 1
+    flags[1] = "edge-nerf"
+    answer = edge_se(*flags, "--pipeline.datamanager.live-pixels-only", "True")
+    assert answer.code == 2
+    assert "add --pipeline.model.economy auto" in answer.err
     assert not (tmp_path / "out").exists()
 
 

@@ -31,10 +31,10 @@ class Pipeline:
         model_config = config.pipeline.model
         model = build_model(config, device)
         if model.needs_cells:
-            hull = needs(views, model_config).hull
-            model.settle(OccupancyGrid.of(hull))
-            if config.pipeline.datamanager.live_pixels_only:
-                views = views.masked(live_pixels(views, hull))
+            told = needs(views, model_config)
+            model.settle(OccupancyGrid.of(told.hull))
+            if config.pipeline.datamanager.live_pixels_only and told.silhouettes:
+                views = views.masked(live_pixels(views, told.hull))
         datamanager = config.pipeline.datamanager.setup(
             views=views, device=device, background_color=SHADES[model_config.background_color]
         )

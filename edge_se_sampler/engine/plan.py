@@ -64,6 +64,10 @@ def _check(plan: TrainerConfig) -> None:
     for flag, value in at_least_one.items():
         if value is None or value < 1:
             raise InputError(f"--{flag} is {value}: must be at least 1")
+    if plan.pipeline.datamanager.live_pixels_only and isinstance(model, NeRFModelConfig) and model.economy == "off":
+        raise InputError(
+            "--pipeline.datamanager.live-pixels-only has no effect here; add --pipeline.model.economy auto"
+        )
     if model.width is None or model.width < 2:
         raise InputError(
             f"--pipeline.model.width is {model.width}: must be at least 2 (the direction's layer has half)"

@@ -102,8 +102,8 @@ def _silhouette(mask: np.ndarray) -> Silhouette:
     return Silhouette(cv2.integral(mask.astype(np.uint8)), np.count_nonzero(inner) == np.count_nonzero(mask))
 
 
-def carve(views: Views, shown: dict[int, Silhouette], box: Box, side: float) -> Hull:
-    """The cells of a box that may hold something; without silhouettes, all that views see.
+def carve(views: Views, shown: dict[int, Silhouette], box: Box, side: float) -> Hull | None:
+    """The cells of a box that may hold something, None if there are none; without silhouettes, all that views see.
 
     Args:
         shown: silhouettes by the number of their view.
@@ -119,6 +119,8 @@ def carve(views: Views, shown: dict[int, Silhouette], box: Box, side: float) -> 
         centers = corner + (kept + 0.5) * size
         in_box = (np.abs(centers - box.middle) < box.half + size / 2).all(axis=1)
         kept = kept[in_box][_stays(views, shown, centers[in_box], size)]
+    if not len(kept):
+        return None
     low, high = kept.min(axis=0), kept.max(axis=0)
     cells = np.zeros(high - low + 1, dtype=bool)
     cells[tuple((kept - low).T)] = True
