@@ -43,6 +43,43 @@ class BenchSamplers:
 
 
 @dataclass(frozen=True)
+class BenchScoring:
+    """Time and memory of squared errors scored exactly, by the coarse network, or remembered, against Random's; and
+    how well the cheap ones rank."""
+
+    output_path: Path | None = None
+    """A json to write besides printing."""
+    workplace: Path = Path("bench")
+    """Where the scene is kept."""
+    scene: str = "bricks"
+    """One of edge-se scenes."""
+    size: Literal["paper", "small", "tiny"] = "small"
+    """Of the dense networks."""
+    rays: int = 1024
+    """Of a step."""
+    rounds: int = 15
+    """Of timed steps, each scoring in turn; medians are reported."""
+    learning: int = 300
+    """Iterations before rankings are compared."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.scoring import bench_scoring, scene_in, table_of
+        from edge_se_sampler.data.made.catalogue import ANALOG_OF
+        from edge_se_sampler.engine.files import make_folder, write_json
+
+        _check_known("scene", (self.scene,), ANALOG_OF)
+        if min(self.rays, self.rounds, self.learning) < 1:
+            raise InputError("--rays, --rounds and --learning must be at least 1")
+        if self.output_path is not None:
+            make_folder(self.output_path.parent, "--output-path, folder")
+        data = scene_in(self.workplace, self.scene)
+        result = bench_scoring(data, self.size, self.rays, self.rounds, self.learning)
+        print(table_of(result))
+        if self.output_path is not None:
+            write_json(self.output_path, result)
+
+
+@dataclass(frozen=True)
 class BenchQuality:
     """Train a method on a made scene for some minutes; leave result.json and curve.png."""
 
@@ -357,6 +394,7 @@ class BenchChart:
 
 BENCHES: dict[str, type] = {
     "samplers": BenchSamplers,
+    "scoring": BenchScoring,
     "quality": BenchQuality,
     "nerfstudio": BenchNerfstudio,
     "paper": BenchPaper,

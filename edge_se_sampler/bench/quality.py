@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.data.made.folder import make_scenes
+from edge_se_sampler.bench.scoring import scene_in
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.files import make_folder, write_json
@@ -32,9 +32,7 @@ def bench_quality(
     """
     require_pyplot()
     make_folder(output_dir, "--output-dir")
-    data = workplace / "scenes" / scene
-    if not data.exists():
-        make_scenes(data.parent, [scene])
+    data = scene_in(workplace, scene)
     config = registered_methods()[method].specification.config
     trainer = prepare(
         replace(

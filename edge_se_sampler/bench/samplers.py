@@ -124,29 +124,28 @@ _PEAK = "import sys; from edge_se_sampler.bench.samplers import training_peak; p
 
 def memory_ratio(rays: int = 1024) -> dict[str, float]:
     """Peak memory of training with SE against training with Random, each in a process of its own."""
-    peaks = {}
-    for method in ("vanilla-nerf", "se-nerf"):
-        command = [sys.executable, "-c", _PEAK, method, str(rays)]
-        peaks[method] = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    return {
-        "rays": rays,
-        "random_bytes": peaks["vanilla-nerf"],
-        "se_bytes": peaks["se-nerf"],
-        "ratio": peaks["se-nerf"] / peaks["vanilla-nerf"],
-    }
+    random, se = (peak_bytes(method, rays, "small", "exact") for method in ("vanilla-nerf", "se-nerf"))
+    return {"rays": rays, "random_bytes": random, "se_bytes": se, "ratio": se / random}
 
 
-def training_peak(method: str, rays: str) -> int:
-    """Resident bytes, above the level after imports, of a few late training steps of the small network."""
+def peak_bytes(method: str, rays: int, size: str, scoring: str) -> float:
+    """`training_peak` in a process of its own."""
+    command = [sys.executable, "-c", _PEAK, method, str(rays), size, scoring]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def training_peak(method: str, rays: str, size: str, scoring: str) -> int:
+    """Resident bytes, above the level after imports, of a few late training steps."""
     noise = np.random.default_rng(0).integers(0, 256, (8, 100, 100, 3), dtype=np.uint8)
     pose = np.eye(4)[:3]
     pose[2, 3] = 4
     lens = np.full((8, 2), 100.0)
     views = Views(tuple("abcdefgh"), tuple(noise), None, np.tile(pose, (8, 1, 1)), lens, lens / 2)
     config = registered_methods()[method].specification.config
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0)
+    how = scoring if method == "se-nerf" else "exact"
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0, se_scoring=how)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=int(rays), pixel_sampler=sampler)
-    model = replace(config.pipeline.model, size="small")
+    model = replace(config.pipeline.model, size=size)
     config = planned(replace(config, pipeline=replace(config.pipeline, datamanager=manager, model=model)), views)
     before = resident_memory()
     pipeline = Pipeline.build(config, views, "cpu")
