@@ -15,7 +15,7 @@ from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.engine.trainer import Trainer, adam
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf import model as model_module
 
@@ -139,3 +139,20 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_the_weights_are_spo
     with pytest.raises(FloatingPointError, match=r"step 3.*--optimizer\.lr"):
         trainer.train_iteration(3)
     assert torch.equal(model.coarse.density.weight, before)
+
+
+@pytest.mark.parametrize("supported", [True, False])
+def test_a_fused_step_where_torch_has_one(supported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = torch.optim.Adam
+
+    def old(*arguments: Any, **settings: Any) -> torch.optim.Adam:
+        if settings.get("fused") and not supported:
+            raise RuntimeError("`fused=True` requires all the params to be floating point Tensors of supported devices")
+        return made(*arguments, **settings)
+
+    monkeypatch.setattr(torch.optim, "Adam", old)
+    weight = torch.nn.Parameter(torch.ones(3))
+    optimizer = adam([[weight]], OptimizerConfig(eps=1e-9, fused=True))
+    assert bool(optimizer.defaults["fused"]) == supported
+    assert optimizer.defaults["eps"] == 1e-9
+    assert not adam([[weight]], OptimizerConfig()).defaults["fused"]

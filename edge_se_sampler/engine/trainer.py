@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
@@ -40,10 +40,7 @@ class Trainer:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
         self.planned_steps = config.max_num_iterations or 0
         groups = pipeline.model.parameter_groups()
-        adam = config.optimizer
-        self.optimizer = torch.optim.Adam(
-            [{"params": weights} for weights, _ in groups], 1.0, eps=adam.eps, fused=adam.fused or None
-        )
+        self.optimizer = adam([weights for weights, _ in groups], config.optimizer)
         self.rates = [rate for _, rate in groups]
         self.next_step = 0
         self.elapsed = 0.0
@@ -221,6 +218,17 @@ class Trainer:
         finally:
             for number, handler in previous:
                 signal.signal(number, handler)
+
+
+def adam(groups: list[list[torch.nn.Parameter]], config: OptimizerConfig) -> torch.optim.Adam:
+    """Adam over groups of weights; each step sets their learning rates."""
+    parts = [{"params": weights} for weights in groups]
+    if config.fused:
+        try:
+            return torch.optim.Adam(parts, 1.0, eps=config.eps, fused=True)
+        except RuntimeError:  # before torch 2.4 a GPU's weights only
+            pass
+    return torch.optim.Adam(parts, 1.0, eps=config.eps)
 
 
 def choose_device(device_type: str) -> str:

@@ -100,18 +100,18 @@ class OccupancyGrid(nn.Module):
         t = begin + (torch.arange(count, device=begin.device) + (0.5 if jitter is None else jitter)) * step
         inside = t < end
         within = torch.minimum(t, end)  # beyond, cell numbers would mean nothing
-        cell = torch.zeros(t.shape, dtype=torch.int32, device=t.device)
+        cell = torch.zeros(t.shape, dtype=torch.int64, device=t.device)
         origin, direction = (rays.origins - self.corner) / self.side, rays.directions / self.side
         for axis, size in enumerate(self.possible.shape):
             at = torch.addcmul(origin[:, axis : axis + 1], within, direction[:, axis : axis + 1])
-            cell = cell * size + at.int().clamp_(0, size - 1)
+            cell = cell * size + at.long().clamp_(0, size - 1)
         inside &= self.occupied.reshape(-1)[cell]
         packed = torch.nonzero(inside.reshape(-1))[:, 0]
         ray = torch.div(packed, count, rounding_mode="floor")
         number = inside.sum(dim=1)
         t = t.reshape(-1)[packed]
         positions = torch.addcmul(rays.origins[ray], t[:, None], rays.directions[ray])
-        return Samples(t, ray, number.cumsum(0) - number, positions, cell.reshape(-1)[packed].long())
+        return Samples(t, ray, number.cumsum(0) - number, positions, cell.reshape(-1)[packed])
 
     def _span(self, rays: RayBundle) -> tuple[Tensor, Tensor]:
         """Where rays enter and leave the box, (n, 1) each; the end is not after the beginning for those that miss."""
