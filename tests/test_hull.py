@@ -183,6 +183,16 @@ def _whole(mask: np.ndarray) -> Any:
     return hull_module.Silhouette(cv2.integral(mask.astype(np.uint8)), True)
 
 
+def test_what_is_masked_may_be_the_object() -> None:
+    """Alpha is 0 where a mask forbids to look: nothing is carved there."""
+    views = views_of(rods())
+    left = np.arange(100) < 50
+    hidden = with_masks(views, lambda _, alpha: alpha * ~left)
+    masks = tuple(np.broadcast_to(~left, (100, 100)).copy() for _ in range(VIEWS))
+    assert missed(views, hull_of(replace(hidden, masks=masks))) == 0
+    assert missed(views, hull_of(hidden)) > 0
+
+
 def test_what_an_image_cuts_off_is_kept() -> None:
     """A long rod leaves every image: the views know nothing of what lies outside."""
     points = np.linspace(-1, 1, 8000)[:, None] * (0, 0, 1.9)

@@ -92,9 +92,13 @@ def footprint(views: Views, box: Box) -> float:
 
 
 def silhouettes(views: Views) -> dict[int, Silhouette]:
-    """By number, of the views that show both foreground and background."""
-    masks = {i: image[..., 3] > 0 for i, image in enumerate(views.images) if image.shape[2] == 4}
-    return {i: _silhouette(mask) for i, mask in masks.items() if mask.any() and not mask.all()}
+    """By number, of the views that show both foreground and background; what is masked may be either."""
+    found = {}
+    for i, image in enumerate(views.images):
+        shown = image[..., 3] > 0 if image.shape[2] == 4 else np.ones(image.shape[:2], dtype=bool)
+        if shown.any() and not shown.all():
+            found[i] = _silhouette(shown if views.masks is None else shown | ~views.masks[i])
+    return found
 
 
 def _silhouette(mask: np.ndarray) -> Silhouette:
