@@ -18,6 +18,8 @@ from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.scenes import made_scenes
 from edge_se_sampler.bench.paper.tables import alike
 from edge_se_sampler.bench.paper.verdict import failed, verdicts
+from edge_se_sampler.bench.schedule.summary import failures
+from edge_se_sampler.bench.stability.summary import totals
 
 ROOT = Path(__file__).parent.parent
 
@@ -79,10 +81,10 @@ def test_the_readme_quotes_the_papers_tables():
         fields = []
         for table in PAPERS:
             runs = [run for run in alike(of_table(table)) if run["strategy"] == strategy]
-            failures = sum(map(failed, runs))
+            bad = sum(map(failed, runs))
             assert {(run["scene"], run["seed"]) for run in runs} == set(product(SCENES, (0, 1, 2)))
             mean = f"{statistics.mean(run['psnr'] for run in runs):.2f}"
-            fields.append(f"{mean}, {failures} of {len(runs)} failed" if failures else mean)
+            fields.append(f"{mean}, {bad} of {len(runs)} failed" if bad else mean)
         assert f"| {label} | " + " | ".join(fields) + " |" in (ROOT / "README.md").read_text()
 
 
@@ -113,6 +115,35 @@ def test_the_verdicts_are_what_the_committed_runs_say():
     assert told["verdicts"] == json.loads(json.dumps(verdicts(told["runs"])))
     for claim in told["verdicts"]:
         assert f"| {claim['text']} | {claim['source']} | {claim['verdict']} |" in (ROOT / "README.md").read_text()
+
+
+def test_the_readme_quotes_the_failures_of_auto():
+    result_of_auto = result("schedule/result.json")
+    told = failures(result_of_auto["runs"])
+    assert told == result_of_auto["failures"]
+    assert len({(run["table"], run["scene"]) for run in result_of_auto["runs"]}) == 28
+    assert {run["seed"] for run in result_of_auto["runs"] if run["part"] == "failures"} == set(range(10))
+    _, most = told["auto_interval"]
+    assert (
+        f"Of {told['pairs']} pairs Random failed in {told['random']}, `auto` in {told['auto']} (at most "
+        f"{100 * most:.1f} % of runs like these, by the 95 % interval)"
+    ) in " ".join((ROOT / "README.md").read_text().split())
+
+
+MAPPED = ("vanilla-nerf", "revived", "precrop-nerf", "edge-se-nerf", "auto", "auto-sharper")
+
+
+@pytest.mark.parametrize(
+    "label",
+    ["base", "f 1%", "f 30%", "off centre", "10 views", "black", "random", "textured", "softplus", "torch weights",
+     "noise 1", "depth 8", "rate x3"],
+)  # fmt: skip
+def test_the_readme_quotes_the_map(label: str):
+    told = result("stability/result.json")
+    assert told["totals"] == json.loads(json.dumps(totals(told["runs"])))
+    place = {(row["label"], row["strategy"]): row for row in told["totals"]}
+    fields = [f"{place[label, name]['failures']} of {place[label, name]['runs']}" for name in MAPPED]
+    assert f"| {label} | " + " | ".join(fields) + " |" in (ROOT / "README.md").read_text()
 
 
 @pytest.mark.slow

@@ -144,10 +144,11 @@ def draw_survival(runs: list[dict[str, Any]]) -> Any:
     for axis in axes.ravel()[len(numbers) :]:
         axis.set_visible(False)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=8, frameon=False)
-    figure.supylabel("share of runs that show the object", fontsize=9)
-    figure.supxlabel("% of the iterations", fontsize=9, y=0.5 / (1.9 * rows + 0.7))
-    figure.tight_layout(rect=(0, 0.6 / (1.9 * rows + 0.7), 1, 1))
+    figure.legend(handles, labels, loc="lower center", ncols=5, fontsize=8, frameon=False)
+    inch = 1 / (1.9 * rows + 0.7)
+    figure.supylabel("share of runs that show the object", fontsize=9, x=0.005)
+    figure.supxlabel("% of the iterations", fontsize=9, y=0.48 * inch)
+    figure.tight_layout(rect=(0.015, 0.62 * inch, 1, 1))
     return figure
 
 
@@ -169,7 +170,7 @@ def draw_sheet(runs: list[dict[str, Any]], views: Path, columns: int = 4) -> Any
             axis.set(xticks=[], yticks=[])
         for axis, (run, path) in zip(row, spread, strict=False):
             axis.imshow(iio.imread(path), interpolation="nearest", vmin=0, vmax=255)
-            label = STRATEGIES[run["strategy"]].label.split(",")[0]
+            label = STRATEGIES[run["strategy"]].label
             axis.set_title(f"{label}\n{points()[run['point']].label}", fontsize=6.5)
         for axis in row[len(spread) :]:
             axis.set_visible(False)
