@@ -69,7 +69,7 @@ class LeanModelConfig(ModelConfig):
     """Distance between samples, in sides of a cell."""
     features: int = 8
     """Numbers kept at each corner of a cell; 0: the network alone has to know the scene."""
-    feature_rate: float = 10.0
+    feature_rate: float = 6.0
     """Learning rate of the features, in the network's."""
 
 
@@ -123,10 +123,12 @@ SIZES: dict[str, SizePreset[NeRFModelConfig]] = {
 }
 
 
+# tiny on seed 100, 2500 steps, rate 2e-3 and features ten times that against 6e-3 and six times: bricks 32.23 and
+# 32.61 dB, ficus 30.13 and 30.36, drums 29.28 and 29.71
 LEAN: dict[str, SizePreset[LeanModelConfig]] = {
     "paper": SizePreset(LeanModelConfig("paper", 64, 2, 4, 2), 2e-3, 1024, 30_000),
     "small": SizePreset(LeanModelConfig("small", 64, 2, 4, 2), 2e-3, 512, 20_000),
-    "tiny": SizePreset(LeanModelConfig("tiny", 64, 2, 4, 2), 2e-3, 256, 12_000),
+    "tiny": SizePreset(LeanModelConfig("tiny", 64, 2, 4, 2), 6e-3, 256, 12_000),
 }
 
 
