@@ -170,7 +170,7 @@ def test_the_command_leaves_table_and_pictures_and_goes_on(made: Path, tmp_path:
     theirs, out = tmp_path / "theirs.json", tmp_path / "out"
     theirs.write_text(json.dumps(GOOD))
     (tmp_path / "w" / "scenes").mkdir(parents=True)
-    (tmp_path / "w" / "scenes" / "chart").symlink_to(made.parent)
+    (tmp_path / "w" / "scenes" / "mic").symlink_to(made)
     flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--scenes", "mic", "--seeds", 0, "--seconds", 2]
     answer = edge_se("bench", "chart", *flags, "--variants", "lean", "random", "--external", theirs)
     assert answer.code == 0, answer

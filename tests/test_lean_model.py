@@ -11,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_model, tiny_rays
+from tiny import check_gradients, tiny_model, tiny_rays
 from torch import Tensor
 
 from edge_se_sampler.data.blender import read_blender
@@ -68,20 +68,7 @@ def loss_of(model: LeanModel) -> Tensor:
 
 def test_gradients_of_everything_against_finite_differences() -> None:
     model = model_in(ball(), background_color="random").train()
-    loss_of(model).backward()
-    rng, h = np.random.default_rng(0), 1e-7
-    for name, parameter in model.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.any(), name
-        step = torch.from_numpy(rng.normal(size=parameter.shape))
-        analytic = float((parameter.grad * step).sum())
-        with torch.no_grad():
-            values = []
-            for sign in (1, -2):
-                parameter += sign * h * step
-                values.append(float(loss_of(model)))
-            parameter += h * step
-        assert (values[0] - values[1]) / (2 * h) == pytest.approx(analytic, rel=1e-4, abs=1e-7), name
+    check_gradients(model, lambda: loss_of(model))
 
 
 def test_culled_rendering_equals_rendering_everything_with_nothing_outside(

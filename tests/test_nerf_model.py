@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_model, tiny_rays, with_constant_density
+from tiny import check_gradients, tiny_model, tiny_rays, with_constant_density
 from torch import Tensor, nn
 
 from edge_se_sampler.cameras import RayBundle
@@ -247,22 +247,7 @@ def test_gradients_of_every_layer_against_finite_differences(occupied: Any) -> N
     def loss() -> Tensor:
         return model.loss(rendered(model), batch)[0].sum()
 
-    loss().backward()
-    rng = np.random.default_rng(0)
-    h = 1e-7
-    for name, parameter in model.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.any(), name
-        step = torch.from_numpy(rng.normal(size=parameter.shape))
-        analytic = float((parameter.grad * step).sum())
-        with torch.no_grad():
-            values = []
-            for sign in (1, -2):
-                parameter += sign * h * step
-                values.append(float(loss()))
-            parameter += h * step
-        numeric = (values[0] - values[1]) / (2 * h)
-        assert numeric == pytest.approx(analytic, rel=1e-4, abs=1e-7), name
+    check_gradients(model, loss)
 
 
 def test_the_fine_error_does_not_pull_at_the_coarse_network() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
+from torch import nn
 
 from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.data.blender import Views
@@ -73,3 +76,23 @@ def tiny_views(
     lens = np.tile([7.0, 8.0], (count, 1))
     middle = np.tile([width / 2, height / 2], (count, 1))
     return Views(tuple(f"view {i}" for i in range(count)), images, masks, np.tile(poses, (count, 1, 1)), lens, middle)
+
+
+def check_gradients(model: nn.Module, loss: Callable[[], torch.Tensor]) -> None:
+    """A float64 model's gradients of a loss, along a random direction in every parameter, by finite differences."""
+    loss().backward()
+    rng = np.random.default_rng(0)
+    h = 1e-7
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.any(), name
+        step = torch.from_numpy(rng.normal(size=parameter.shape))
+        analytic = float((parameter.grad * step).sum())
+        with torch.no_grad():
+            values = []
+            for sign in (1, -2):
+                parameter += sign * h * step
+                values.append(float(loss()))
+            parameter += h * step
+        numeric = (values[0] - values[1]) / (2 * h)
+        assert numeric == pytest.approx(analytic, rel=1e-4, abs=1e-7), name

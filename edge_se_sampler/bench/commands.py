@@ -355,8 +355,8 @@ class BenchChart:
         from edge_se_sampler.bench.chart.train import Scale, run_in_own_process
         from edge_se_sampler.bench.chart.variant import VARIANTS, cells
         from edge_se_sampler.bench.experiment import begun, missing, run_cells
+        from edge_se_sampler.bench.scoring import scene_in
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
-        from edge_se_sampler.data.made.folder import make_scenes
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
@@ -376,15 +376,10 @@ class BenchChart:
             return
         require_pyplot()
         make_folder(self.output_dir, "--output-dir")
-        folder = self.workplace / "scenes" / "chart"
-        wanted = [scene for scene in self.scenes if not (folder / scene).exists()]
-        if wanted:
-            make_scenes(
-                folder, wanted, size=scale.image_size, num_train=scale.num_train, num_val=1, num_test=scale.num_test
-            )
+        data = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
         run_cells(
             todo, result, path, lambda: ThreadPoolExecutor(1), run_in_own_process,
-            lambda cell: (scale, folder / cell.scene),
+            lambda cell: (scale, data[cell.scene]),
         )  # fmt: skip
         write_outputs(result, others or result.get("external", []), self.output_dir)
         for error in result["errors"]:

@@ -35,13 +35,10 @@ TRIED = 12
 
 @dataclass(frozen=True)
 class Scale:
-    """How long, and on what."""
+    """How long."""
 
     seconds: float = 60
     """Of training; the plan, which learning rate and phases follow, is as long."""
-    image_size: int = 100
-    num_train: int = 50
-    num_test: int = 10
 
 
 def run_in_own_process(cell: Cell, scale: Scale, data: Path) -> dict[str, Any]:
