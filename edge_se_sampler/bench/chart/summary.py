@@ -137,16 +137,16 @@ def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]]) -> Any:
 def draw_parts(runs: list[Run]) -> Any:
     """The same for what is changed of the recommended method, a panel a kind of change."""
     groups: list[Group] = [group for group in GROUPS if group not in ("methods", "scorings")]
-    figure, axes = require_pyplot().subplots(1, len(groups), figsize=(4.4 * len(groups), 4.4), sharey=True)
+    figure, axes = require_pyplot().subplots(1, len(groups), figsize=(4.4 * len(groups), 5.2), sharey=True)
     for axis, group in zip(axes, groups, strict=True):
         every = comparable(runs)
         for i, (name, mine) in enumerate({n: m for n, m in every.items() if VARIANTS[n].group == group}.items()):
             _draw_curve(axis, mine, VARIANTS[name].label, f"C{(i + 1) % 10}", "-" if i < 9 else "--", False)
         if RECOMMENDED in every:
-            _draw_curve(axis, every[RECOMMENDED], "lean-nerf", "#d62728", "-", True)
+            _draw_curve(axis, every[RECOMMENDED], "lean-nerf", "black", "-", True)
         axis.set(xscale="log", xlabel="seconds of training", title=GROUPS[group])
         _finish(axis)
-        axis.legend(fontsize=7, frameon=False, loc="lower right")
+        axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
     axes[0].set_ylabel("test PSNR [dB]")
     figure.tight_layout()
     return figure
