@@ -12,17 +12,20 @@ import pytest
 from edge_se_sampler.bench import experiment
 from edge_se_sampler.bench.paper.cell import PRESETS, Preset
 from edge_se_sampler.bench.schedule import cell as cell_module
+from edge_se_sampler.bench.schedule import summary as summary_module
 from edge_se_sampler.bench.schedule.cell import (
     CHOICE_SEEDS,
     FRACTIONS,
+    LENGTHS,
     OF_LENGTHS,
     Cell,
     Scale,
+    choice_cells,
     failure_cells,
     length_cells,
     settings_of,
 )
-from edge_se_sampler.bench.schedule.summary import failures, lengths, table
+from edge_se_sampler.bench.schedule.summary import best_shares, failures, lengths, table
 
 
 def test_there_are_280_pairs() -> None:
@@ -34,10 +37,16 @@ def test_there_are_280_pairs() -> None:
 
 
 def test_the_fixed_share_is_chosen_on_other_seeds() -> None:
-    every = length_cells((0, 1, 2))
-    assert len(every) == len({*every}) == 4 * len(OF_LENGTHS) * (2 * 5 + 3 * 6)
-    assert {cell.seed for cell in every if cell.arm == "auto"} == {0, 1, 2}
-    assert {cell.arm for cell in every if cell.seed in CHOICE_SEEDS} == {*FRACTIONS}
+    choice = choice_cells()
+    assert len(choice) == len({*choice}) == len(LENGTHS) * len(OF_LENGTHS) * 2 * 5
+    assert {cell.seed for cell in choice} == {*CHOICE_SEEDS}
+    assert {cell.arm for cell in choice} == {*FRACTIONS}
+    paired = length_cells({300: "0.2", 1000: "0.5"}, (0, 1, 2))
+    assert len(paired) == len({*paired}) == 2 * 3 * len(OF_LENGTHS) * 2
+    assert {(cell.iterations, cell.arm) for cell in paired} == {
+        (300, "0.2"), (300, "auto"), (1000, "0.5"), (1000, "auto"),
+    }  # fmt: skip
+    assert {cell.seed for cell in paired} == {0, 1, 2}
 
 
 def test_arms_differ_in_the_schedule_alone() -> None:
@@ -99,8 +108,9 @@ def test_the_command_runs_what_is_left(tmp_path: Path, edge_se: Any, monkeypatch
     monkeypatch.setattr(experiment, "executor_of", lambda *_: lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(cell_module, "SCENES", ("mic",))
     monkeypatch.setattr(cell_module, "CONFIGURATIONS", (2, 6))
-    monkeypatch.setattr(cell_module, "LENGTHS", (3,))
-    monkeypatch.setattr(cell_module, "OF_LENGTHS", ((2, "mic"),))
+    for module in (cell_module, summary_module):
+        monkeypatch.setattr(module, "LENGTHS", (3,))
+        monkeypatch.setattr(module, "OF_LENGTHS", ((2, "mic"),))
     out = tmp_path / "out"
     flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--failure-seeds", 0, "--length-seeds", 0]
     assert edge_se("bench", "schedule", *flags, "--parts", "failures").code == 0
@@ -108,7 +118,10 @@ def test_the_command_runs_what_is_left(tmp_path: Path, edge_se: Any, monkeypatch
     answer = edge_se("bench", "schedule", *flags)
     assert answer.code == 0, answer
     result = json.loads((out / "result.json").read_text())
-    assert len(result["runs"]) == 4 + 2 * 5 + 6
+    assert len(result["runs"]) == 4 + 2 * 5 + 2
+    reported = [run for run in result["runs"] if run["part"] == "lengths" and run["seed"] == 0]
+    assert {run["arm"] for run in reported} == {"auto", *best_shares(result["runs"]).values()}
+    assert (out / "lengths.png").stat().st_size > 0
     assert result["failures"]["pairs"] == 2
     assert "Of 2 paired runs" in (out / "table.md").read_text()
 

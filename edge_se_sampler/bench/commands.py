@@ -300,8 +300,8 @@ class BenchSchedule(_Parallel):
         from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
         from edge_se_sampler.bench.paper.cell import PRESETS
         from edge_se_sampler.bench.paper.scenes import made_scenes
-        from edge_se_sampler.bench.schedule.cell import Scale, failure_cells, length_cells, run_cell
-        from edge_se_sampler.bench.schedule.summary import write_outputs
+        from edge_se_sampler.bench.schedule.cell import Scale, choice_cells, failure_cells, length_cells, run_cell
+        from edge_se_sampler.bench.schedule.summary import best_shares, write_outputs
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
@@ -310,7 +310,7 @@ class BenchSchedule(_Parallel):
         workers = self.processes()
         scale, path = Scale(), self.output_dir / "result.json"
         todo = failure_cells(scale, self.failure_seeds) if "failures" in self.parts else []
-        todo += length_cells(self.length_seeds) if "lengths" in self.parts else []
+        todo += choice_cells() if "lengths" in self.parts else []
         result = begun(path, scale)
         require_pyplot()
         new_executor = executor_of(workers, self.scheduler)
@@ -318,6 +318,9 @@ class BenchSchedule(_Parallel):
         data_of = made_scenes(PRESETS["cpu"], todo, self.workplace)
         runs = self.workplace / "runs"
         run_cells(todo, result, path, new_executor, run_cell, lambda cell: (data_of(cell), runs))
+        if "lengths" in self.parts and not result["errors"]:
+            todo += length_cells(best_shares(result["runs"]), self.length_seeds)
+            run_cells(todo, result, path, new_executor, run_cell, lambda cell: (data_of(cell), runs))
         write_outputs(result, self.output_dir)
         for error in result["errors"]:
             print(f"{error['part']}, table {error['table']}, {error['scene']}, {error['arm']}: {error['error']}")

@@ -58,12 +58,18 @@ def failure_cells(scale: Scale, seeds: tuple[int, ...]) -> list[Cell]:
     return [Cell("failures", table, scene, scale.iterations, arm, seed) for seed, table, scene, arm in every]
 
 
-def length_cells(seeds: tuple[int, ...]) -> list[Cell]:
-    """Auto and every fixed share over planned lengths, short ones first; fixed ones alone on the seeds of choice."""
+def choice_cells() -> list[Cell]:
+    """Every fixed share over planned lengths, short ones first, on the seeds of choice."""
+    every = product(LENGTHS, CHOICE_SEEDS, OF_LENGTHS, FRACTIONS)
+    return [Cell("lengths", table, scene, length, share, seed) for length, seed, (table, scene), share in every]
+
+
+def length_cells(best: dict[int, str], seeds: tuple[int, ...]) -> list[Cell]:
+    """Auto, and of each planned length the fixed share that was best, paired."""
     return [
         Cell("lengths", table, scene, length, arm, seed)
-        for length, seed, (table, scene) in product(LENGTHS, (*CHOICE_SEEDS, *seeds), OF_LENGTHS)
-        for arm in (*FRACTIONS, *(() if seed in CHOICE_SEEDS else ("auto",)))
+        for seed, (length, share), (table, scene) in product(seeds, sorted(best.items()), OF_LENGTHS)
+        for arm in (share, "auto")
     ]
 
 

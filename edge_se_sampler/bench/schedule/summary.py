@@ -32,7 +32,7 @@ def write_outputs(result: dict[str, Any], output_dir: Path) -> None:
     write_result(output_dir / "result.json", result)
     write_atomically(output_dir / "table.md", table(result).encode())
     if result["lengths"]:
-        save_figure(draw_lengths(runs), output_dir / "lengths.png")
+        save_figure(draw_lengths(result["lengths"]), output_dir / "lengths.png")
 
 
 def failures(runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -60,25 +60,41 @@ def failures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return told
 
 
+def shares(runs: list[dict[str, Any]]) -> dict[int, dict[str, float]]:
+    """Planned length -> PSNR of every fixed share on the seeds of choice, of those that have all."""
+    told = {}
+    for length in LENGTHS:
+        chosen_on = [
+            r for r in runs if r["part"] == "lengths" and r["iterations"] == length and r["seed"] in CHOICE_SEEDS
+        ]
+        means = {arm: _mean([r for r in chosen_on if r["arm"] == arm]) for arm in FRACTIONS}
+        if None not in means.values():
+            told[length] = means
+    return told
+
+
+def best_shares(runs: list[dict[str, Any]]) -> dict[int, str]:
+    """Planned length -> the fixed share with the highest PSNR on the seeds of choice."""
+    return {length: max(means, key=lambda arm, of=means: of[arm]) for length, means in shares(runs).items()}
+
+
 def lengths(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of every planned length: the share chosen on other seeds, and auto's paired difference from it."""
-    told = []
-    for length in LENGTHS:
-        mine = [run for run in runs if run["part"] == "lengths" and run["iterations"] == length]
-        chosen_on, reported = ([r for r in mine if (r["seed"] in CHOICE_SEEDS) == on] for on in (True, False))
-        means = {
-            arm: mean for arm in FRACTIONS if (mean := _mean([r for r in chosen_on if r["arm"] == arm])) is not None
+    told, best = [], best_shares(runs)
+    for length, means in shares(runs).items():
+        reported = [r for r in runs if r["part"] == "lengths" and r["iterations"] == length]
+        place = {
+            (r["table"], r["scene"], r["seed"], r["arm"]): r["psnr"] for r in reported if r["seed"] not in CHOICE_SEEDS
         }
-        if len(means) < len(FRACTIONS):
-            continue
-        best = max(means, key=lambda arm, of=means: of[arm])
-        place = {(r["table"], r["scene"], r["seed"], r["arm"]): r["psnr"] for r in reported}
-        pairs = [key[:3] for key in place if key[3] == "auto" and (*key[:3], best) in place]
+        pairs = sorted(key[:3] for key in place if key[3] == "auto" and (*key[:3], best[length]) in place)
         if pairs:
-            found = paired_difference(
-                [(f"{t} {s}", place[t, s, seed, "auto"] - place[t, s, seed, best]) for t, s, seed in pairs]
-            )
-            told.append({"iterations": length, "best": best, "chosen_by": means, **asdict(found)})
+            differences = [
+                (f"{t} {s}", place[t, s, seed, "auto"] - place[t, s, seed, best[length]]) for t, s, seed in pairs
+            ]
+            told.append({
+                "iterations": length, "best": best[length], "chosen_by": means, "differences": differences,
+                **asdict(paired_difference(differences)),
+            })  # fmt: skip
     return told
 
 
@@ -121,27 +137,30 @@ def table(result: dict[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def draw_lengths(runs: list[dict[str, Any]]) -> Any:
-    """PSNR over the planned length, a panel a scene; every arm a line, its seeds dots."""
-    figure, axes = require_pyplot().subplots(1, len(OF_LENGTHS), figsize=(3.1 * len(OF_LENGTHS), 3.2))
-    for axis, (number, scene) in zip(axes, OF_LENGTHS, strict=True):
-        for i, arm in enumerate((*FRACTIONS, "auto")):
-            mine = [
-                r
-                for r in runs
-                if r["part"] == "lengths" and (r["table"], r["scene"], r["arm"]) == (number, scene, arm)
-                if r["seed"] not in CHOICE_SEEDS
-            ]
-            steps = sorted({run["iterations"] for run in mine})
-            means = [np.mean([run["psnr"] for run in mine if run["iterations"] == step]) for step in steps]
-            color = "#d62728" if arm == "auto" else require_pyplot().get_cmap("Blues")(0.3 + 0.14 * i)
-            axis.plot(steps, means, color=color, lw=2 if arm == "auto" else 1.2, label=arm)
-            axis.plot([r["iterations"] for r in mine], [r["psnr"] for r in mine], ".", color=color, ms=3)
-        axis.set(xscale="log", xlabel="planned iterations", title=f"{scene}, {TABLES[number].title.split(', ')[-1]}")
-        axis.title.set_fontsize(9)
+def draw_lengths(told: list[dict[str, Any]]) -> Any:
+    """How much hangs on a fixed share, and how far auto is from the best: a colour a planned length, a dot a pair."""
+    figure, (left, right) = require_pyplot().subplots(1, 2, figsize=(9.5, 3.4))
+    for place, row in enumerate(told):
+        color, means = f"C{place}", row["chosen_by"]
+        below = [means[share] - means[row["best"]] for share in FRACTIONS]
+        left.plot(range(len(FRACTIONS)), below, "o-", color=color, ms=4, label=f"{row['iterations']:,}")
+        values = [value for _, value in row["differences"]]
+        right.plot(place + np.linspace(-0.15, 0.15, len(values)), values, ".", color=color, ms=5, alpha=0.6)
+        if row["low"] is not None:
+            right.vlines(place + 0.28, row["low"], row["high"], color=color, lw=3)
+        right.plot(place + 0.28, row["mean"], "_", color=color, ms=12, mew=2)
+    left.set_xticks(range(len(FRACTIONS)), FRACTIONS)
+    left.set(xlabel="fixed share of the iterations", ylabel="PSNR below the best share [dB]")
+    left.set_title("A fixed early phase (seeds of choice)", fontsize=10)
+    left.legend(title="planned iterations", fontsize=7, title_fontsize=7, frameon=False)
+    right.axhline(-MARGIN, color="black", lw=0.8, ls="--")
+    right.axhline(0, color="black", lw=0.8)
+    right.text(-0.4, -MARGIN, "not inferior above", fontsize=7, va="bottom")
+    right.set_xticks(range(len(told)), [f"{row['iterations']:,}\nagainst {row['best']}" for row in told])
+    right.set(xlabel="planned iterations", ylabel="auto - best share [dB]")
+    right.set_title("Auto against the best one (other seeds, mean and 95 %)", fontsize=10)
+    for axis in (left, right):
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylabel("test PSNR [dB]")
-    axes[-1].legend(title="early phase", fontsize=7, title_fontsize=7, frameon=False)
     figure.tight_layout()
     return figure
