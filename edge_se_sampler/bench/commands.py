@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart
+from edge_se_sampler.errors import InputError, check_known
 from edge_se_sampler.methods import registered_methods
 
 
@@ -67,7 +67,7 @@ class BenchScoring:
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_folder, write_json
 
-        _check_known("scene", (self.scene,), ANALOG_OF)
+        check_known("scene", (self.scene,), ANALOG_OF)
         if min(self.rays, self.rounds, self.learning) < 1:
             raise InputError("--rays, --rounds and --learning must be at least 1")
         if self.output_path is not None:
@@ -155,13 +155,6 @@ class _Parallel:
         return self.workers or default_workers()
 
 
-def _check_known(flag: str, chosen: Sequence[object], known: Iterable[object]) -> None:
-    known = tuple(known)
-    for name in chosen:
-        if name not in known:
-            raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
-
-
 @dataclass(frozen=True, kw_only=True)
 class BenchPaper(_Parallel):
     """Remake the paper's tables and figures, and judge its claims; leave result.json, tables.md, pictures and
@@ -196,9 +189,9 @@ class BenchPaper(_Parallel):
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
-        _check_known("tables", self.tables, TABLES)
-        _check_known("scenes", self.scenes, SCENES)
-        _check_known("strategies", self.strategies, STRATEGIES)
+        check_known("tables", self.tables, TABLES)
+        check_known("scenes", self.scenes, SCENES)
+        check_known("strategies", self.strategies, STRATEGIES)
         if not self.seeds:
             raise InputError("--seeds: give at least one")
         workers = self.processes()
@@ -257,8 +250,8 @@ class BenchStability(_Parallel):
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
-        _check_known("points", self.points, range(len(points())))
-        _check_known("strategies", self.strategies, STRATEGIES)
+        check_known("points", self.points, range(len(points())))
+        check_known("strategies", self.strategies, STRATEGIES)
         if not self.seeds:
             raise InputError("--seeds: give at least one")
         workers = self.processes()
@@ -327,69 +320,6 @@ class BenchSchedule(_Parallel):
         print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
 
 
-@dataclass(frozen=True)
-class BenchChart:
-    """Chart PSNR against training seconds: methods, and one thing changed at a time; leave result.json, table.md and
-    pictures. One training at a time, with all cores: leave the machine alone. Goes on where it was ended."""
-
-    output_dir: Path
-    """Where the result goes; trainings that it already has are kept."""
-    workplace: Path = Path("bench")
-    """Where scenes are kept."""
-    variants: tuple[str, ...] = ()
-    """Which; none: all. --dry-run tells what they are."""
-    scenes: tuple[str, ...] = ("bricks",)
-    """Of the seven."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Of weights, pixels and jitter."""
-    seconds: float = 60
-    """Of training, and of the plan, of each."""
-    external: tuple[Path, ...] = ()
-    """Results of other programs, drawn beside: json files with name, version, command, machine, and runs, each with
-    scene, seed and curve, a list of [seconds, PSNR]."""
-    dry_run: tyro.conf.UseCounterAction[int] = 0
-    """Only tell which variants there are, and how much is done; trains nothing, writes nothing."""
-
-    def run(self) -> None:
-        from concurrent.futures import ThreadPoolExecutor
-
-        from edge_se_sampler.bench.chart.external import read_external
-        from edge_se_sampler.bench.chart.summary import write_outputs
-        from edge_se_sampler.bench.chart.train import Scale, run_in_own_process
-        from edge_se_sampler.bench.chart.variant import VARIANTS, cells
-        from edge_se_sampler.bench.experiment import begun, missing, run_cells
-        from edge_se_sampler.bench.scoring import scene_in
-        from edge_se_sampler.data.made.catalogue import ANALOG_OF
-        from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.show import require_pyplot
-
-        _check_known("variants", self.variants, VARIANTS)
-        _check_known("scenes", self.scenes, ANALOG_OF)
-        if not (self.seeds and self.scenes):
-            raise InputError("--seeds and --scenes: give at least one of each")
-        if not 1 <= self.seconds < float("inf"):
-            raise InputError(f"--seconds is {self.seconds}: must be at least 1")
-        others = [read_external(path) for path in self.external]
-        scale, path = Scale(seconds=self.seconds), self.output_dir / "result.json"
-        todo, result = cells(self.variants, self.scenes, self.seeds), begun(path, scale)
-        if self.dry_run:
-            for name in self.variants or VARIANTS:
-                print(f"{name:<16} {VARIANTS[name].label}")
-            print(f"{len(todo)} trainings of {scale.seconds:g} s, {len(missing(todo, result))} still to do")
-            return
-        require_pyplot()
-        make_folder(self.output_dir, "--output-dir")
-        data = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
-        run_cells(
-            todo, result, path, lambda: ThreadPoolExecutor(1), run_in_own_process,
-            lambda cell: (scale, data[cell.scene]),
-        )  # fmt: skip
-        write_outputs(result, others or result.get("external", []), self.output_dir)
-        for error in result["errors"]:
-            print(f"{error['variant']}, {error['scene']}, {error['seed']}: {error['error']}")
-        print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
-
-
 BENCHES: dict[str, type] = {
     "samplers": BenchSamplers,
     "scoring": BenchScoring,
@@ -399,4 +329,5 @@ BENCHES: dict[str, type] = {
     "stability": BenchStability,
     "schedule": BenchSchedule,
     "chart": BenchChart,
+    "beside": BenchBeside,
 }

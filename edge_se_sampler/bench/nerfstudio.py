@@ -36,6 +36,7 @@ from edge_se_sampler.errors import InputError
 METHODS = ("vanilla-nerf", "edge-se-nerf")
 SIZE, VIEWS, TEST_VIEWS = 64, 30, 3
 OFFSET = (0.2, 0.15)
+RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
 
 
 def bench_nerfstudio(
@@ -104,18 +105,18 @@ def _begun(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def host_config(method: str, seed: int, data: Path, runs: Path, rays: int) -> Any:
-    """A method's config on the scene."""
-    from nerfstudio.configs.method_configs import all_methods
+def host_config(method: str, seed: int, data: Path, runs: Path, flags: Sequence[str] = ()) -> Any:
+    """A method's config on the scene, as ns-train makes it of flags."""
+    import tyro
+    from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
-    config = copy.deepcopy(all_methods[method])
+    config = copy.deepcopy(tyro.cli(AnnotatedBaseConfigUnion, args=[method, *flags]))
     config.output_dir, config.vis, config.machine.seed = runs, "tensorboard", seed
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
     manager = config.pipeline.datamanager
     manager.data, manager.dataparser = data, BlenderDataParserConfig()
-    manager.train_num_rays_per_batch = rays
     config.set_timestamp()
     return config
 
@@ -131,7 +132,7 @@ def host_trainer(config: Any, test_mode: str) -> Any:
 
 def _run(method: str, seed: int, data: Path, runs: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Train once, and look at the test views."""
-    config = host_config(method, seed, data, runs, settings["rays"])
+    config = host_config(method, seed, data, runs, [RAYS, str(settings["rays"])])
     config.max_num_iterations = settings["iterations"]
     model = config.pipeline.model
     model.num_coarse_samples, model.num_importance_samples = settings["samples"]
@@ -142,14 +143,20 @@ def _run(method: str, seed: int, data: Path, runs: Path, settings: dict[str, Any
     return {"method": method, "seed": seed, "seconds": seconds, "cpu_seconds": cpu} | _looked_at(trainer, data)
 
 
-def _looked_at(trainer: Any, data: Path) -> dict[str, Any]:
-    """PSNR on the test views, and the error on the object as a share of what the background alone has there."""
+def rendered_views(trainer: Any) -> list[Any]:
+    """The test views as nerfstudio renders them now, (H, W, 3) each."""
     pipeline = trainer.pipeline
     pipeline.eval()
     cameras = pipeline.datamanager.eval_dataset.cameras.to(pipeline.device)
+    outputs = [pipeline.model.get_outputs_for_camera(cameras[i : i + 1]) for i in range(len(cameras))]
+    pipeline.train()
+    return [shown["rgb_fine" if "rgb_fine" in shown else "rgb"].cpu().numpy() for shown in outputs]
+
+
+def _looked_at(trainer: Any, data: Path) -> dict[str, Any]:
+    """PSNR on the test views, and the error on the object as a share of what the background alone has there."""
     pictures = pictures_of(read_blender(data, "test"))
-    rendered = [pipeline.model.get_outputs_for_camera(cameras[i : i + 1])["rgb_fine"] for i in range(len(pictures))]
-    rows = [measures(shown.cpu().numpy(), picture, 1.0) for shown, picture in zip(rendered, pictures, strict=True)]
+    rows = [measures(*pair, 1.0) for pair in zip(rendered_views(trainer), pictures, strict=True)]
     background = background_measures(pictures, 1.0)
     return {
         "psnr": statistics.mean(row["psnr"] or 0.0 for row in rows),
@@ -183,7 +190,7 @@ def costs(data: Path, runs: Path, rays: int, rounds: int = 3) -> dict[str, Any]:
 
 def cost(method: str, late: str, data: str, runs: str, rays: str) -> None:
     """Print what a late step costs: seconds, and peak resident bytes above the level after set-up."""
-    config = host_config(method, 0, Path(data), Path(runs), int(rays))
+    config = host_config(method, 0, Path(data), Path(runs), [RAYS, rays])
     config.pipeline.datamanager.pixel_sampler.early = "uniform"
     config.pipeline.datamanager.pixel_sampler.late = late
     config.pipeline.datamanager.pixel_sampler.early_fraction = 0.0

@@ -29,12 +29,12 @@ def config_of(
     """
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
-    config = host_config(name, 42, scene, runs, rays)
+    config = host_config(name, 42, scene, runs)
     config.machine.device_type = "cpu"
     config.max_num_iterations = PLANNED
     manager, model = config.pipeline.datamanager, config.pipeline.model
     manager.dataparser = BlenderDataParserConfig(alpha_color=alpha)
-    manager.eval_num_rays_per_batch = rays
+    manager.train_num_rays_per_batch = manager.eval_num_rays_per_batch = rays
     if hasattr(model, "num_coarse_samples"):
         model.num_coarse_samples = model.num_importance_samples = 8
     else:

@@ -9,9 +9,12 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from edge_se_sampler.errors import InputError
+
+ProgramName = Literal["nerf-pytorch", "tensorf", "nerfstudio-vanilla-nerf", "nerfstudio-nerfacto"]
+"""Those that `bench beside` runs."""
 
 
 def read_external(path: Path) -> dict[str, Any]:

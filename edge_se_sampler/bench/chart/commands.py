@@ -1,0 +1,121 @@
+"""The chart's commands: edge-se bench chart, and bench beside for other programs. Torch-free until one runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from edge_se_sampler.bench.chart.external import ProgramName
+from edge_se_sampler.errors import InputError, check_known
+
+
+@dataclass(frozen=True)
+class BenchChart:
+    """Chart PSNR against training seconds: methods, and one thing changed at a time; leave result.json, table.md and
+    pictures. One training at a time, with all cores: leave the machine alone. Goes on where it was ended."""
+
+    output_dir: Path
+    """Where the result goes; trainings that it already has are kept."""
+    workplace: Path = Path("bench")
+    """Where scenes are kept."""
+    variants: tuple[str, ...] = ()
+    """Which; none: all. --dry-run tells what they are."""
+    scenes: tuple[str, ...] = ("bricks",)
+    """Of the seven."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of weights, pixels and jitter."""
+    seconds: float = 60
+    """Of training, and of the plan, of each."""
+    external: tuple[Path, ...] = ()
+    """Results of other programs, drawn beside: json files with name, version, command, machine, and runs, each with
+    scene, seed and curve, a list of [seconds, PSNR]."""
+    dry_run: tyro.conf.UseCounterAction[int] = 0
+    """Only tell which variants there are, and how much is done; trains nothing, writes nothing."""
+
+    def run(self) -> None:
+        from concurrent.futures import ThreadPoolExecutor
+
+        from edge_se_sampler.bench.chart.external import read_external
+        from edge_se_sampler.bench.chart.summary import write_outputs
+        from edge_se_sampler.bench.chart.train import Scale, run_in_own_process
+        from edge_se_sampler.bench.chart.variant import VARIANTS, cells
+        from edge_se_sampler.bench.experiment import begun, missing, run_cells
+        from edge_se_sampler.bench.scoring import scene_in
+        from edge_se_sampler.data.made.catalogue import ANALOG_OF
+        from edge_se_sampler.engine.files import make_folder
+        from edge_se_sampler.show import require_pyplot
+
+        check_known("variants", self.variants, VARIANTS)
+        check_known("scenes", self.scenes, ANALOG_OF)
+        _check_chosen(self.seeds, self.scenes, self.seconds)
+        others = [read_external(path) for path in self.external]
+        scale, path = Scale(seconds=self.seconds), self.output_dir / "result.json"
+        todo, result = cells(self.variants, self.scenes, self.seeds), begun(path, scale)
+        if self.dry_run:
+            for name in self.variants or VARIANTS:
+                print(f"{name:<16} {VARIANTS[name].label}")
+            print(f"{len(todo)} trainings of {scale.seconds:g} s, {len(missing(todo, result))} still to do")
+            return
+        require_pyplot()
+        make_folder(self.output_dir, "--output-dir")
+        data = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
+        run_cells(
+            todo, result, path, lambda: ThreadPoolExecutor(1), run_in_own_process,
+            lambda cell: (scale, data[cell.scene]),
+        )  # fmt: skip
+        write_outputs(result, others or result.get("external", []), self.output_dir)
+        for error in result["errors"]:
+            print(f"{error['variant']}, {error['scene']}, {error['seed']}: {error['error']}")
+        print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchBeside:
+    """Train another program, unchanged, on the chart's scenes, timed and looked at as ours are; leave a json for
+    bench chart --external. One training at a time, with all cores. Goes on where it was ended."""
+
+    program: ProgramName
+    """Which. nerf-pytorch and tensorf come as a --checkout and want what they import; nerfstudio's are in the
+    environment."""
+    output_path: Path
+    """The json; runs that it already has are kept."""
+    checkout: Path | None = None
+    """A git checkout of the program."""
+    flags: str = ""
+    """The program's own, in one string, besides those that name the data."""
+    label: str = ""
+    """What tells these flags from others, in the chart."""
+    workplace: Path = Path("bench")
+    """Where scenes are kept."""
+    scenes: tuple[str, ...] = ("bricks",)
+    """Of the seven."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of weights, pixels and jitter."""
+    seconds: float = 60
+    """Of training, of each."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.chart.beside import run_beside
+        from edge_se_sampler.bench.scoring import scene_in
+        from edge_se_sampler.data.made.catalogue import ANALOG_OF
+        from edge_se_sampler.engine.files import make_folder
+
+        check_known("scenes", self.scenes, ANALOG_OF)
+        _check_chosen(self.seeds, self.scenes, self.seconds)
+        make_folder(self.output_path.parent, "--output-path, folder")
+        scenes = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
+        result = run_beside(
+            self.program, self.checkout, self.label, self.flags, scenes, self.seeds, self.seconds, self.output_path
+        )
+        for run in result["runs"]:
+            seconds, psnr = run["curve"][-1]
+            print(f"{result['name']}, {run['scene']}, {run['seed']}: {psnr:.2f} dB after {seconds:.0f} s")
+
+
+def _check_chosen(seeds: tuple[int, ...], scenes: tuple[str, ...], seconds: float) -> None:
+    if not (seeds and scenes):
+        raise InputError("--seeds and --scenes: give at least one of each")
+    if not 1 <= seconds < float("inf"):
+        raise InputError(f"--seconds is {seconds}: must be at least 1")
