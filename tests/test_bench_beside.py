@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.bench.chart import beside
-from edge_se_sampler.bench.chart.beside import Clock, Task, TimeIsUp, mean_psnr, train
+from edge_se_sampler.bench.chart.beside import Clock, Scale, Task, TimeIsUp, mean_psnr, train
 from edge_se_sampler.bench.chart.external import read_external
 from edge_se_sampler.data.made import make_scenes
 
@@ -76,9 +76,9 @@ def checkout(folder: Path, name: str, text: str) -> Path:
 
 def test_the_clock_stands_still_while_a_program_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(beside.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(Scale, "clock", lambda _: now[0])
     monkeypatch.setattr(beside, "FEWER_LOOKS", (2, 7, 20))
-    clock = Clock(10)
+    clock = Clock(Scale(10))
 
     def look() -> float:
         now[0] += 50
@@ -103,7 +103,7 @@ def test_a_program_is_run_with_each_seed_and_its_curves_are_kept(
     (tmp_path / "w" / "scenes").mkdir(parents=True)
     (tmp_path / "w" / "scenes" / "mic").symlink_to(made)
     flags = ["--program", "nerf-pytorch", "--checkout", theirs, "--output-path", path, "--workplace", tmp_path / "w",
-             "--scenes", "mic", "--seconds", 1, "--label", "small"]  # fmt: skip
+             "--scenes", "mic", "--seconds", 1, "--threads", 2, "--label", "small"]  # fmt: skip
     answer = edge_se("bench", "beside", *flags, "--flags=--netdepth 4", "--seeds", 0)
     assert answer.code == 0, answer
     answer = edge_se("bench", "beside", *flags, "--flags=--netdepth 4", "--seeds", 0, 1)
@@ -158,6 +158,8 @@ def test_the_program_that_asks_for_a_gpu_is_looked_at_without(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(beside, "FEWER_LOOKS", ())
-    told = train(Task("tensorf", checkout(tmp_path / "theirs", "train.py", TENSORF), "", made, 0, 0.2))
+    told = train(
+        Task("tensorf", checkout(tmp_path / "theirs", "train.py", TENSORF), "", made, 0, Scale(0.2, threads=2))
+    )
     ((_, psnr),) = told["curve"]
     assert psnr == pytest.approx(mean_psnr([np.ones((24, 24, 3), np.float32)], made), abs=1e-3)

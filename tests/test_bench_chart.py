@@ -83,7 +83,7 @@ def test_a_run_is_planned_to_fill_its_time_and_is_looked_at_on_the_way(
 
 def test_a_plan_grows_with_its_time(made: Path, tmp_path: Path) -> None:
     config = config_of(Cell("lean", "mic", 0), made, tmp_path)
-    short, long = (iterations_within(config, seconds) for seconds in (2, 20))
+    short, long = (iterations_within(config, Scale(seconds)) for seconds in (2, 20))
     assert 3 * short < long
 
 
@@ -174,7 +174,9 @@ def test_the_command_leaves_table_and_pictures_and_goes_on(made: Path, tmp_path:
     flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--scenes", "mic", "--seeds", 0, "--seconds", 2]
     answer = edge_se("bench", "chart", *flags, "--variants", "lean", "random", "--external", theirs)
     assert answer.code == 0, answer
-    assert {path.name for path in out.iterdir()} == {"result.json", "table.md", "chart.png", "parts.png", "scenes.png"}
+    assert {path.name for path in out.iterdir()} == {
+        "result.json", "table.md", "chart.png", "parts.png", "costs.png", "scenes.png", "chart.html",
+    }  # fmt: skip
     result = json.loads((out / "result.json").read_text())
     assert [run["variant"] for run in result["runs"]] == ["lean", "random"]
     assert result["errors"] == []

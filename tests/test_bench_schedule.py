@@ -14,13 +14,12 @@ from edge_se_sampler.bench.paper.cell import PRESETS, Preset
 from edge_se_sampler.bench.schedule import cell as cell_module
 from edge_se_sampler.bench.schedule import summary as summary_module
 from edge_se_sampler.bench.schedule.cell import (
-    CHOICE_SEEDS,
     FRACTIONS,
-    LENGTHS,
     OF_LENGTHS,
     Cell,
     Scale,
     choice_cells,
+    choice_seeds,
     failure_cells,
     length_cells,
     settings_of,
@@ -37,15 +36,14 @@ def test_there_are_280_pairs() -> None:
 
 
 def test_the_fixed_share_is_chosen_on_other_seeds() -> None:
-    choice = choice_cells()
-    assert len(choice) == len({*choice}) == len(LENGTHS) * len(OF_LENGTHS) * 2 * 5
-    assert {cell.seed for cell in choice} == {*CHOICE_SEEDS}
+    choice = choice_cells(1000)
+    assert len(choice) == len({*choice}) == len(OF_LENGTHS) * 2 * 5
+    assert {cell.seed for cell in choice} == {100, 101}
+    assert {cell.seed for cell in choice_cells(10_000)} == {100}
     assert {cell.arm for cell in choice} == {*FRACTIONS}
-    paired = length_cells({300: "0.2", 1000: "0.5"}, (0, 1, 2))
-    assert len(paired) == len({*paired}) == 2 * 3 * len(OF_LENGTHS) * 2
-    assert {(cell.iterations, cell.arm) for cell in paired} == {
-        (300, "0.2"), (300, "auto"), (1000, "0.5"), (1000, "auto"),
-    }  # fmt: skip
+    paired = length_cells(1000, "0.5", (0, 1, 2))
+    assert len(paired) == len({*paired}) == 3 * len(OF_LENGTHS) * 2
+    assert {(cell.iterations, cell.arm) for cell in paired} == {(1000, "0.5"), (1000, "auto")}
     assert {cell.seed for cell in paired} == {0, 1, 2}
 
 
@@ -86,7 +84,7 @@ def length_runs(auto: float) -> list[dict[str, Any]]:
         {"part": "lengths", "table": number, "scene": scene, "iterations": 300, "arm": arm, "seed": seed,
          "psnr": level + (0.01 * seed if seed < 100 else 0.0)}
         for number, scene in OF_LENGTHS
-        for seed, of in [*((seed, levels) for seed in CHOICE_SEEDS), *((seed, others) for seed in (0, 1, 2))]
+        for seed, of in [*((seed, levels) for seed in choice_seeds(300)), *((seed, others) for seed in (0, 1, 2))]
         for arm, level in of.items()
     ]  # fmt: skip
 
@@ -109,7 +107,7 @@ def test_the_command_runs_what_is_left(tmp_path: Path, edge_se: Any, monkeypatch
     monkeypatch.setattr(cell_module, "SCENES", ("mic",))
     monkeypatch.setattr(cell_module, "CONFIGURATIONS", (2, 6))
     for module in (cell_module, summary_module):
-        monkeypatch.setattr(module, "LENGTHS", (3,))
+        monkeypatch.setattr(module, "LENGTHS", (3, 4))
         monkeypatch.setattr(module, "OF_LENGTHS", ((2, "mic"),))
     out = tmp_path / "out"
     flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--failure-seeds", 0, "--length-seeds", 0]
@@ -118,7 +116,7 @@ def test_the_command_runs_what_is_left(tmp_path: Path, edge_se: Any, monkeypatch
     answer = edge_se("bench", "schedule", *flags)
     assert answer.code == 0, answer
     result = json.loads((out / "result.json").read_text())
-    assert len(result["runs"]) == 4 + 2 * 5 + 2
+    assert len(result["runs"]) == 4 + (2 + 1) * 5 + 2 * 2
     reported = [run for run in result["runs"] if run["part"] == "lengths" and run["seed"] == 0]
     assert {run["arm"] for run in reported} == {"auto", *best_shares(result["runs"]).values()}
     assert (out / "lengths.png").stat().st_size > 0

@@ -287,13 +287,21 @@ class BenchSchedule(_Parallel):
     failure_seeds: tuple[int, ...] = tuple(range(10))
     """Of the runs that may fail."""
     length_seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the runs over planned lengths; the fixed length is chosen on seeds 100 and 101."""
+    """Of the runs over planned lengths; the fixed length is chosen on others."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
         from edge_se_sampler.bench.paper.cell import PRESETS
         from edge_se_sampler.bench.paper.scenes import made_scenes
-        from edge_se_sampler.bench.schedule.cell import Scale, choice_cells, failure_cells, length_cells, run_cell
+        from edge_se_sampler.bench.schedule.cell import (
+            LENGTHS,
+            Cell,
+            Scale,
+            choice_cells,
+            failure_cells,
+            length_cells,
+            run_cell,
+        )
         from edge_se_sampler.bench.schedule.summary import best_shares, write_outputs
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
@@ -303,17 +311,28 @@ class BenchSchedule(_Parallel):
         workers = self.processes()
         scale, path = Scale(), self.output_dir / "result.json"
         todo = failure_cells(scale, self.failure_seeds) if "failures" in self.parts else []
-        todo += choice_cells() if "lengths" in self.parts else []
         result = begun(path, scale)
         require_pyplot()
         new_executor = executor_of(workers, self.scheduler)
         make_folder(self.output_dir, "--output-dir")
-        data_of = made_scenes(PRESETS["cpu"], todo, self.workplace)
-        runs = self.workplace / "runs"
-        run_cells(todo, result, path, new_executor, run_cell, lambda cell: (data_of(cell), runs))
-        if "lengths" in self.parts and not result["errors"]:
-            todo += length_cells(best_shares(result["runs"]), self.length_seeds)
-            run_cells(todo, result, path, new_executor, run_cell, lambda cell: (data_of(cell), runs))
+        lengths = LENGTHS if "lengths" in self.parts else ()
+        data_of = made_scenes(
+            PRESETS["cpu"], [*todo, *(cell for length in lengths for cell in choice_cells(length))], self.workplace
+        )
+        runs, errors = self.workplace / "runs", []
+
+        def train(cells: list[Cell]) -> None:
+            run_cells(cells, result, path, new_executor, run_cell, lambda cell: (data_of(cell), runs))
+            errors.extend(result["errors"])
+
+        if todo:
+            train(todo)
+        for length in lengths:
+            train(choice_cells(length))
+            best = best_shares(result["runs"]).get(length)
+            if best is not None:
+                train(length_cells(length, best, self.length_seeds))
+        result["errors"] = errors
         write_outputs(result, self.output_dir)
         for error in result["errors"]:
             print(f"{error['part']}, table {error['table']}, {error['scene']}, {error['arm']}: {error['error']}")

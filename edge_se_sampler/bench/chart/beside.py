@@ -20,10 +20,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
@@ -33,7 +32,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.chart.external import ProgramName, read_external
-from edge_se_sampler.bench.chart.train import LOOKS
+from edge_se_sampler.bench.chart.train import LOOKS, Scale
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.evaluation import measures, pictures_of
@@ -52,14 +51,14 @@ class TimeIsUp(BaseException):
 class Clock:
     """Training seconds of a program, and its PSNR at looks."""
 
-    def __init__(self, seconds: float) -> None:
-        self.seconds, self.looks = seconds, [look for look in FEWER_LOOKS if look < seconds]
+    def __init__(self, scale: Scale) -> None:
+        self.scale, self.looks = scale, [look for look in FEWER_LOOKS if look < scale.seconds]
         self.curve: list[list[float]] = []
         self.steps, self._stood, self._began = 0, 0.0, 0.0
 
     def begin(self) -> None:
         """The data are about to be read."""
-        self._began = time.perf_counter()
+        self._began = self.scale.clock()
 
     def step_over(self, psnr: Callable[[], float]) -> None:
         """After a step: look, if it is time to.
@@ -67,15 +66,15 @@ class Clock:
         Raises:
             TimeIsUp: after the last look.
         """
-        now = time.perf_counter()
+        now = self.scale.clock()
         spent = now - self._began - self._stood
         self.steps += 1
-        over = spent >= self.seconds
+        over = spent >= self.scale.seconds
         if over or (self.looks and spent >= self.looks[0]):
             self.looks = [look for look in self.looks if look > spent]
             with torch.no_grad():
                 self.curve.append([round(spent, 3), round(psnr(), 3)])
-        self._stood += time.perf_counter() - now
+        self._stood += self.scale.clock() - now
         if over:
             raise TimeIsUp
 
@@ -91,12 +90,12 @@ class Task:
     """Of its own, besides those that name the data."""
     data: Path
     seed: int
-    seconds: float
+    scale: Scale
 
 
 def run_beside(
     program: ProgramName, checkout: Path | None, label: str, flags: str, scenes: dict[str, Path],
-    seeds: Sequence[int], seconds: float, path: Path,
+    seeds: Sequence[int], scale: Scale, path: Path,
 ) -> dict[str, Any]:  # fmt: skip
     """Train another program on scenes (name -> folder) with seeds, and keep its curves in a json of results.
 
@@ -108,16 +107,16 @@ def run_beside(
         InputError: the program is not there, its flags are refused, or the json is of another one.
     """
     name = f"{program}, {label}" if label else program
-    told = {"name": name, "version": _version(checkout), "command": f"{program} {flags}".strip()}
+    told = {"name": name, "version": _version(checkout), "command": f"{program} {flags}".strip(), **asdict(scale)}
     result: dict[str, Any] = {**told, "machine": machine(), "runs": []}
     if path.exists():
         result = read_external(path)
-        if any(result[key] != value for key, value in told.items()):
-            raise InputError(f"{path}: holds another program's runs, or under other flags; name another --output-path")
+        if any(result.get(key) != value for key, value in told.items()):
+            raise InputError(f"{path}: holds runs of something else, or under other flags; name another --output-path")
     done = {(run["scene"], run["seed"]) for run in result["runs"]}
     for seed, scene in product(seeds, scenes):
         if (scene, seed) not in done:
-            task = Task(program, checkout, flags, scenes[scene].resolve(), seed, seconds)
+            task = Task(program, checkout, flags, scenes[scene].resolve(), seed, scale)
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
                 measured = alone.submit(train, task).result()
             result["runs"].append({"scene": scene, "seed": seed} | measured)
@@ -127,7 +126,8 @@ def run_beside(
 
 def train(task: Task) -> dict[str, Any]:
     """Steps and curve of a training; in a process of its own, for programs do as they like with what is global."""
-    clock = Clock(task.seconds)
+    torch.set_num_threads(task.scale.threads)
+    clock = Clock(task.scale)
     if task.checkout is not None:
         sys.path.insert(0, str(task.checkout.resolve()))
     with (

@@ -14,7 +14,7 @@ from edge_se_sampler.errors import InputError, check_known
 @dataclass(frozen=True)
 class BenchChart:
     """Chart PSNR against training seconds: methods, and one thing changed at a time; leave result.json, table.md and
-    pictures. One training at a time, with all cores: leave the machine alone. Goes on where it was ended."""
+    pictures, and chart.html. Goes on where it was ended."""
 
     output_dir: Path
     """Where the result goes; trainings that it already has are kept."""
@@ -28,6 +28,9 @@ class BenchChart:
     """Of weights, pixels and jitter."""
     seconds: float = 60
     """Of training, and of the plan, of each."""
+    threads: int = 1
+    """Of a training. One: as many trainings at once as there are cores, timed in CPU seconds; more: fewer at once,
+    timed by the clock on the wall, so leave the machine alone."""
     external: tuple[Path, ...] = ()
     """Results of other programs, drawn beside: json files with name, version, command, machine, and runs, each with
     scene, seed and curve, a list of [seconds, PSNR]."""
@@ -38,10 +41,10 @@ class BenchChart:
         from concurrent.futures import ThreadPoolExecutor
 
         from edge_se_sampler.bench.chart.external import read_external
-        from edge_se_sampler.bench.chart.summary import write_outputs
+        from edge_se_sampler.bench.chart.outputs import write_outputs
         from edge_se_sampler.bench.chart.train import Scale, run_in_own_process
         from edge_se_sampler.bench.chart.variant import VARIANTS, cells
-        from edge_se_sampler.bench.experiment import begun, missing, run_cells
+        from edge_se_sampler.bench.experiment import begun, default_workers, missing, run_cells
         from edge_se_sampler.bench.scoring import scene_in
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_folder
@@ -49,9 +52,9 @@ class BenchChart:
 
         check_known("variants", self.variants, VARIANTS)
         check_known("scenes", self.scenes, ANALOG_OF)
-        _check_chosen(self.seeds, self.scenes, self.seconds)
+        _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
         others = [read_external(path) for path in self.external]
-        scale, path = Scale(seconds=self.seconds), self.output_dir / "result.json"
+        scale, path = Scale(self.seconds, self.threads), self.output_dir / "result.json"
         todo, result = cells(self.variants, self.scenes, self.seeds), begun(path, scale)
         if self.dry_run:
             for name in self.variants or VARIANTS:
@@ -60,9 +63,10 @@ class BenchChart:
             return
         require_pyplot()
         make_folder(self.output_dir, "--output-dir")
+        workers = max(1, default_workers() // self.threads)
         data = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
         run_cells(
-            todo, result, path, lambda: ThreadPoolExecutor(1), run_in_own_process,
+            todo, result, path, lambda: ThreadPoolExecutor(workers), run_in_own_process,
             lambda cell: (scale, data[cell.scene]),
         )  # fmt: skip
         write_outputs(result, others or result.get("external", []), self.output_dir)
@@ -74,7 +78,7 @@ class BenchChart:
 @dataclass(frozen=True, kw_only=True)
 class BenchBeside:
     """Train another program, unchanged, on the chart's scenes, timed and looked at as ours are; leave a json for
-    bench chart --external. One training at a time, with all cores. Goes on where it was ended."""
+    bench chart --external. Goes on where it was ended."""
 
     program: ProgramName
     """Which. nerf-pytorch and tensorf come as a --checkout and want what they import; nerfstudio's are in the
@@ -95,27 +99,39 @@ class BenchBeside:
     """Of weights, pixels and jitter."""
     seconds: float = 60
     """Of training, of each."""
+    threads: int = 1
+    """Of a training, as bench chart has it; one training at a time."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.chart.beside import run_beside
+        from edge_se_sampler.bench.chart.train import Scale
         from edge_se_sampler.bench.scoring import scene_in
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_folder
 
         check_known("scenes", self.scenes, ANALOG_OF)
-        _check_chosen(self.seeds, self.scenes, self.seconds)
+        _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
         make_folder(self.output_path.parent, "--output-path, folder")
         scenes = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
         result = run_beside(
-            self.program, self.checkout, self.label, self.flags, scenes, self.seeds, self.seconds, self.output_path
+            self.program,
+            self.checkout,
+            self.label,
+            self.flags,
+            scenes,
+            self.seeds,
+            Scale(self.seconds, self.threads),
+            self.output_path,
         )
         for run in result["runs"]:
             seconds, psnr = run["curve"][-1]
             print(f"{result['name']}, {run['scene']}, {run['seed']}: {psnr:.2f} dB after {seconds:.0f} s")
 
 
-def _check_chosen(seeds: tuple[int, ...], scenes: tuple[str, ...], seconds: float) -> None:
+def _check_chosen(seeds: tuple[int, ...], scenes: tuple[str, ...], seconds: float, threads: int) -> None:
     if not (seeds and scenes):
         raise InputError("--seeds and --scenes: give at least one of each")
     if not 1 <= seconds < float("inf"):
         raise InputError(f"--seconds is {seconds}: must be at least 1")
+    if threads < 1:
+        raise InputError(f"--threads is {threads}: must be at least 1")

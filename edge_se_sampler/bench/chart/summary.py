@@ -8,36 +8,15 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from edge_se_sampler.bench.chart.train import LOOKS
 from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
-from edge_se_sampler.bench.experiment import write_result
-from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.show import require_pyplot, save_figure
 
 Run = dict[str, Any]
 RECOMMENDED = "lean"
-
-
-def write_outputs(result: dict[str, Any], external: Sequence[dict[str, Any]], output_dir: Path) -> None:
-    """The front in result.json, table.md, chart.png, parts.png and scenes.png, of the runs that there are.
-
-    Raises:
-        InputError: a file cannot be written, or matplotlib is missing.
-    """
-    runs = result["runs"]
-    result["front"] = front(runs)
-    result["external"] = list(external)
-    write_result(output_dir / "result.json", result)
-    if runs:
-        write_atomically(output_dir / "table.md", table(runs).encode())
-        save_figure(draw_chart(runs, external), output_dir / "chart.png")
-        save_figure(draw_parts(runs), output_dir / "parts.png")
-        save_figure(draw_scenes(runs, external), output_dir / "scenes.png")
 
 
 def scenes_of(runs: list[Run]) -> list[str]:
@@ -85,20 +64,25 @@ def front(runs: list[Run]) -> list[dict[str, Any]]:
     return told
 
 
-def table(runs: list[Run]) -> str:
-    """Markdown: of every variant its PSNR at looks, at the end, failures, steps, evaluations and memory."""
+def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
+    """The table's head, and of every group its variants' rows: PSNR at looks and at the end, failures, costs."""
     looks = [look for look in (3, 7, 20, 60) if any(run["seconds"] > look for run in runs)]
     head = ["", *(f"{look} s" for look in looks), "end", "failed", "ms a step", "evaluations a step", "memory"]
+    rows: dict[Group, list[list[str]]] = {}
+    for name, mine in comparable(runs).items():
+        rows.setdefault(VARIANTS[name].group, []).append([VARIANTS[name].label, *_fields(mine, looks)])
+    return head, rows
+
+
+def table(runs: list[Run]) -> str:
+    """Markdown of it."""
     scenes = sorted({run["scene"] for mine in comparable(runs).values() for run in mine})
     parts = [f"Mean test PSNR in dB over {', '.join(scenes)}, medians over seeds, by seconds of training."]
-    for group, title in GROUPS.items():
-        chosen = {name: mine for name, mine in comparable(runs).items() if VARIANTS[name].group == group}
-        if chosen:
-            lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-            lines += [
-                f"| {VARIANTS[name].label} | {' | '.join(_fields(mine, looks))} |" for name, mine in chosen.items()
-            ]
-            parts.append(f"**{title}**\n\n" + "\n".join(lines))
+    head, rows = rows_of(runs)
+    for group, mine in rows.items():
+        lines = [f"| {' | '.join(row)} |" for row in (head, *mine)]
+        lines.insert(1, "|---" * len(head) + "|")
+        parts.append(f"**{GROUPS[group]}**\n\n" + "\n".join(lines))
     return "\n\n".join(parts) + "\n"
 
 
@@ -113,88 +97,3 @@ def _fields(runs: list[Run], looks: list[int]) -> list[str]:
     memory = statistics.median(run["peak_bytes"] for run in runs) / 2**20
     shown = ["–" if value is None else f"{value:.2f}" for value in (*values, end)]
     return [*shown, f"{failed} of {len(runs)}", f"{step:.1f}", f"{asked:,.0f}", f"{memory:,.0f} MiB"]
-
-
-def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]]) -> Any:
-    """PSNR over training seconds of methods and scorings, bands over seeds; other programs dotted."""
-    figure, axis = require_pyplot().subplots(figsize=(8.4, 5.2))
-    shown = {n: m for n, m in comparable(runs).items() if VARIANTS[n].group in ("methods", "scorings")}
-    for i, (name, mine) in enumerate(shown.items()):
-        _draw_curve(axis, mine, VARIANTS[name].label, f"C{i % 10}", "-" if i < 10 else "--", name == RECOMMENDED)
-    common = {run["scene"] for mine in shown.values() for run in mine}
-    for i, program in enumerate(external):
-        mine = [run for run in program["runs"] if run["scene"] in common]
-        if mine:
-            _draw_curve(axis, mine, f"{program['name']} {program['version']}", f"C{i + 3}", ":", False)
-    axis.set(xscale="log", xlabel="seconds of training", ylabel="test PSNR [dB]")
-    axis.set_title(f"mean over {', '.join(sorted(common))}; bands: least to largest of the seeds", fontsize=9)
-    _finish(axis)
-    axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    figure.tight_layout()
-    return figure
-
-
-def draw_parts(runs: list[Run]) -> Any:
-    """The same for what is changed of the recommended method, a panel a kind of change."""
-    groups: list[Group] = [group for group in GROUPS if group not in ("methods", "scorings")]
-    figure, axes = require_pyplot().subplots(1, len(groups), figsize=(4.4 * len(groups), 5.2), sharey=True)
-    for axis, group in zip(axes, groups, strict=True):
-        every = comparable(runs)
-        for i, (name, mine) in enumerate({n: m for n, m in every.items() if VARIANTS[n].group == group}.items()):
-            _draw_curve(axis, mine, VARIANTS[name].label, f"C{(i + 1) % 10}", "-" if i < 9 else "--", False)
-        if RECOMMENDED in every:
-            _draw_curve(axis, every[RECOMMENDED], "lean-nerf", "black", "-", True)
-        axis.set(xscale="log", xlabel="seconds of training", title=GROUPS[group])
-        _finish(axis)
-        axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
-    axes[0].set_ylabel("test PSNR [dB]")
-    figure.tight_layout()
-    return figure
-
-
-def draw_scenes(runs: list[Run], external: Sequence[dict[str, Any]]) -> Any:
-    """Methods, a panel a scene, every seed a line; failed ones end in a cross."""
-    names = scenes_of(runs)
-    columns = min(4, len(names))
-    rows = -(-len(names) // columns)
-    figure, axes = require_pyplot().subplots(
-        rows, columns, figsize=(3.1 * columns, 2.7 * rows), squeeze=False, sharex=True, sharey=True
-    )
-    methods = [name for name, variant in VARIANTS.items() if variant.group == "methods"]
-    for axis, scene in zip(axes.ravel(), names, strict=False):
-        for i, name in enumerate(methods):
-            for run in (run for run in runs if (run["variant"], run["scene"]) == (name, scene)):
-                x, y = [point[0] for point in run["curve"]], [point[-1] for point in run["curve"]]
-                label = VARIANTS[name].label if scene == names[0] and run["seed"] == 0 else None
-                axis.plot(x, y, color=f"C{i}", lw=1, label=label)
-                if run["outcome"] != "learnt":
-                    axis.plot(x[-1], y[-1], "x", color=f"C{i}", ms=6)
-        for program in external:
-            for run in (run for run in program["runs"] if run["scene"] == scene):
-                axis.plot([p[0] for p in run["curve"]], [p[-1] for p in run["curve"]], "k:", lw=1)
-        axis.set(xscale="log", title=scene)
-        _finish(axis)
-    for axis in axes.ravel()[len(names) :]:
-        axis.set_visible(False)
-    figure.legend(loc="lower center", ncols=4, fontsize=8, frameon=False)
-    figure.supylabel("test PSNR [dB]", fontsize=9)
-    figure.tight_layout(rect=(0, 0.09, 1, 1))
-    return figure
-
-
-def _draw_curve(axis: Any, runs: list[Run], label: str, color: str, style: str, strong: bool) -> None:
-    ends = min(run["curve"][-1][0] for run in runs)
-    begins = max(run["curve"][0][0] for run in runs)
-    moments = [begins, *(look for look in LOOKS if begins < look < ends), ends]
-    low, middle, high = ([over_scenes(runs, s, of) for s in moments] for of in (np.min, np.median, np.max))
-    failed = sum(run.get("outcome", "learnt") != "learnt" for run in runs)  # other programs' results tell none
-    label += f", {failed} of {len(runs)} failed" if failed else ""
-    axis.plot(moments, middle, style, color=color, lw=2.4 if strong else 1.3, label=label, zorder=3 if strong else 2)
-    axis.fill_between(moments, low, high, color=color, alpha=0.12, lw=0)
-
-
-def _finish(axis: Any) -> None:
-    axis.grid(alpha=0.25)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.set_xticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
-    axis.minorticks_off()

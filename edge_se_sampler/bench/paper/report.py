@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import statistics
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.page import figure, grid, page
 from edge_se_sampler.bench.paper.cell import TABLES
 from edge_se_sampler.bench.paper.published import LABELS, STRATEGIES
 from edge_se_sampler.bench.paper.tables import LEGEND, VERDICT_LEGEND, Entry, Rows, interval, rows_of
@@ -19,23 +19,6 @@ CAPTIONS = {
     "figure-5": "The paper's figure 5. Training loss of Random, Precrop and Edge; every seed is a line.",
     "figure-6": "The paper's figure 6. Error in the edge band, Precrop against Edge.",
 }
-STYLE = """
-:root { color-scheme: light dark; --line: #8884; --dim: #777; --good: #1a7f37; --bad: #cf222e; --open: #9a6700; }
-body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 1rem; max-width: 72rem; }
-h1 { font-size: 1.6rem; line-height: 1.2 } h2 { margin-top: 2.2rem; font-size: 1.25rem }
-.scroll { overflow-x: auto } .dim { color: var(--dim); font-size: .85rem }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; white-space: nowrap }
-th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid var(--line) }
-th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: Canvas }
-caption { text-align: left; font-weight: 600; padding: .8rem 0 .3rem; white-space: normal }
-td small { display: block; color: var(--dim) } .failed { color: var(--bad) }
-details { border: 1px solid var(--line); border-radius: .5rem; padding: .5rem .8rem; margin: .5rem 0 }
-summary { cursor: pointer } summary b { float: right; margin-left: 1rem }
-summary::after { content: ""; display: block; clear: both }
-.supported { color: var(--good) } .not-supported { color: var(--bad) } .undecided { color: var(--open) }
-figure { margin: 1rem 0 }
-figure img { width: 100%; min-width: 42rem; height: auto; background: white; border-radius: .4rem }
-"""
 
 
 def report(result: dict[str, Any], figures: list[Path]) -> str:
@@ -56,7 +39,7 @@ def report(result: dict[str, Any], figures: list[Path]) -> str:
         f'<p class="dim">{escape(VERDICT_LEGEND)}</p>',
         *map(_claim, result["verdicts"]),
         "<h2>Pictures</h2>",
-        *map(_figure, figures),
+        *(figure(path, CAPTIONS[path.stem]) for path in figures),
         "<h2>Tables</h2>",
         f'<p class="dim">{escape(LEGEND)}</p>',
         *map(_table, rows_of(runs)),
@@ -66,13 +49,7 @@ def report(result: dict[str, Any], figures: list[Path]) -> str:
         "<h2>Settings</h2>",
         f'<p class="dim">{escape(_settings(result))}</p>',
     ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>The paper's experiments, remade</title><style>{STYLE}</style></head>\n<body>\n"
-        + "\n".join(parts)
-        + "\n</body></html>\n"
-    )
+    return page("The paper's experiments, remade", parts)
 
 
 def _claim(claim: dict[str, Any]) -> str:
@@ -93,30 +70,13 @@ def _claim(claim: dict[str, Any]) -> str:
     return (
         f"<details><summary>{escape(claim['text'])} <span class='dim'>({escape(claim['source'])})</span> "
         f"<b class='{claim['verdict'].replace(' ', '-')}'>{claim['verdict']}</b></summary>"
-        f"{_grid(head, [[escape(text) for text in row] for row in rows])}</details>"
-    )
-
-
-def _grid(head: tuple[str, ...], rows: list[list[str]], caption: str = "") -> str:
-    """A table that scrolls sideways where the screen is narrow."""
-    title = f"<caption>{escape(caption)}</caption>" if caption else ""
-    body = "".join("<tr>" + "".join(f"<td>{field}</td>" for field in row) + "</tr>" for row in rows)
-    top = "".join(f"<th>{escape(text)}</th>" for text in head)
-    return f'<div class="scroll"><table>{title}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def _figure(path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
-    caption = escape(CAPTIONS[path.stem])
-    return (
-        f'<figure><div class="scroll"><img alt="{caption}" src="data:image/png;base64,{data}"></div>'
-        f'<figcaption class="dim">{caption}</figcaption></figure>'
+        f"{grid(head, [[escape(text) for text in row] for row in rows])}</details>"
     )
 
 
 def _table(table: Rows) -> str:
     rows = [[escape(label), *map(_field, entries)] for label, entries in table.rows]
-    return _grid(("", *table.scenes, "mean"), rows, f"Table {table.number}: {table.title}")
+    return grid(("", *table.scenes, "mean"), rows, f"Table {table.number}: {table.title}")
 
 
 def _field(entry: Entry | None) -> str:
@@ -141,7 +101,7 @@ def _costs(runs: list[dict[str, Any]]) -> str:
             )
         rows.append(row)
     head = ("", *(f"table {number}" for number in numbers))
-    return _grid(head, rows, "Median CPU seconds of training; small: iterations")
+    return grid(head, rows, "Median CPU seconds of training; small: iterations")
 
 
 def _dead_starts(runs: list[dict[str, Any]]) -> list[str]:
@@ -165,7 +125,7 @@ def _dead_starts(runs: list[dict[str, Any]]) -> list[str]:
             )
     if not rows:
         return []
-    return [_grid(("", "a network dead at the start", "of them failed", "of the others failed"), rows, "Dead starts")]
+    return [grid(("", "a network dead at the start", "of them failed", "of the others failed"), rows, "Dead starts")]
 
 
 def _settings(result: dict[str, Any]) -> str:

@@ -23,8 +23,6 @@ CONFIGURATIONS = (1, 2, 5, 6)
 LENGTHS = (300, 1000, 3000, 10_000)
 OF_LENGTHS = ((1, "drums"), (1, "bricks"), (2, "chair"), (2, "mic"))
 """Table and scene; two centred, two off centre."""
-CHOICE_SEEDS = (100, 101)
-"""The fixed share is chosen on these."""
 
 
 @dataclass(frozen=True)
@@ -58,19 +56,21 @@ def failure_cells(scale: Scale, seeds: tuple[int, ...]) -> list[Cell]:
     return [Cell("failures", table, scene, scale.iterations, arm, seed) for seed, table, scene, arm in every]
 
 
-def choice_cells() -> list[Cell]:
-    """Every fixed share over planned lengths, short ones first, on the seeds of choice."""
-    every = product(LENGTHS, CHOICE_SEEDS, OF_LENGTHS, FRACTIONS)
-    return [Cell("lengths", table, scene, length, share, seed) for length, seed, (table, scene), share in every]
+def choice_cells(length: int) -> list[Cell]:
+    """Every fixed share of a planned length, on its seeds of choice."""
+    every = product(choice_seeds(length), OF_LENGTHS, FRACTIONS)
+    return [Cell("lengths", table, scene, length, share, seed) for seed, (table, scene), share in every]
 
 
-def length_cells(best: dict[int, str], seeds: tuple[int, ...]) -> list[Cell]:
-    """Auto, and of each planned length the fixed share that was best, paired."""
-    return [
-        Cell("lengths", table, scene, length, arm, seed)
-        for seed, (length, share), (table, scene) in product(seeds, sorted(best.items()), OF_LENGTHS)
-        for arm in (share, "auto")
-    ]
+def length_cells(length: int, share: str, seeds: tuple[int, ...]) -> list[Cell]:
+    """Auto and a fixed share of a planned length, paired."""
+    every = product(seeds, OF_LENGTHS, (share, "auto"))
+    return [Cell("lengths", table, scene, length, arm, seed) for seed, (table, scene), arm in every]
+
+
+def choice_seeds(length: int) -> tuple[int, ...]:
+    """The fixed share is chosen on these: two, but one where a training is long."""
+    return (100, 101) if length < LENGTHS[-1] else (100,)
 
 
 def settings_of(cell: Cell, data: Path, output_dir: Path) -> TrainerConfig:

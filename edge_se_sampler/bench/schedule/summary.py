@@ -12,7 +12,7 @@ import numpy as np
 from edge_se_sampler.bench.experiment import write_result
 from edge_se_sampler.bench.paper.cell import TABLES
 from edge_se_sampler.bench.paper.published import SCENES
-from edge_se_sampler.bench.schedule.cell import CHOICE_SEEDS, CONFIGURATIONS, FRACTIONS, LENGTHS, OF_LENGTHS
+from edge_se_sampler.bench.schedule.cell import CONFIGURATIONS, FRACTIONS, LENGTHS, OF_LENGTHS, choice_seeds
 from edge_se_sampler.bench.statistics import paired_difference, wilson
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.show import require_pyplot, save_figure
@@ -65,7 +65,9 @@ def shares(runs: list[dict[str, Any]]) -> dict[int, dict[str, float]]:
     told = {}
     for length in LENGTHS:
         chosen_on = [
-            r for r in runs if r["part"] == "lengths" and r["iterations"] == length and r["seed"] in CHOICE_SEEDS
+            r
+            for r in runs
+            if r["part"] == "lengths" and r["iterations"] == length and r["seed"] in choice_seeds(length)
         ]
         means = {arm: _mean([r for r in chosen_on if r["arm"] == arm]) for arm in FRACTIONS}
         if None not in means.values():
@@ -84,7 +86,9 @@ def lengths(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for length, means in shares(runs).items():
         reported = [r for r in runs if r["part"] == "lengths" and r["iterations"] == length]
         place = {
-            (r["table"], r["scene"], r["seed"], r["arm"]): r["psnr"] for r in reported if r["seed"] not in CHOICE_SEEDS
+            (r["table"], r["scene"], r["seed"], r["arm"]): r["psnr"]
+            for r in reported
+            if r["seed"] not in choice_seeds(length)
         }
         pairs = sorted(key[:3] for key in place if key[3] == "auto" and (*key[:3], best[length]) in place)
         if pairs:
