@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart
+from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart, BenchStep
 from edge_se_sampler.errors import InputError, check_known
 from edge_se_sampler.methods import registered_methods
 
@@ -349,4 +349,5 @@ BENCHES: dict[str, type] = {
     "schedule": BenchSchedule,
     "chart": BenchChart,
     "beside": BenchBeside,
+    "step": BenchStep,
 }

@@ -107,7 +107,7 @@ def run_beside(
         InputError: the program is not there, its flags are refused, or the json is of another one.
     """
     name = f"{program}, {label}" if label else program
-    told = {"name": name, "version": _version(checkout), "command": f"{program} {flags}".strip(), **asdict(scale)}
+    told = {"name": name, "version": version_of(checkout), "command": f"{program} {flags}".strip(), **asdict(scale)}
     result: dict[str, Any] = {**told, "machine": machine(), "runs": []}
     if path.exists():
         result = read_external(path)
@@ -235,7 +235,7 @@ def _seed(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def _version(checkout: Path | None) -> str:
+def version_of(checkout: Path | None) -> str:
     """Of nerfstudio; or the commit of a checkout."""
     try:
         if checkout is None:
