@@ -51,8 +51,8 @@ def comparable(runs: list[Run]) -> dict[str, list[Run]]:
 def front(runs: list[Run]) -> list[dict[str, Any]]:
     """At every look the best variant, and how far the recommended one is from it, dB."""
     told = []
-    for seconds in LOOKS:
-        known = {name: over_scenes(mine, seconds) for name, mine in comparable(runs).items()} if runs else {}
+    for seconds in (look for look in LOOKS if any(run["seconds"] >= look for run in runs)):
+        known = {name: over_scenes(mine, seconds) for name, mine in comparable(runs).items()}
         values = {name: value for name, value in known.items() if value is not None}
         if values:
             best = max(values, key=lambda name, of=values: of[name])
