@@ -12,7 +12,7 @@ import pytest
 
 from edge_se_sampler.bench.chart import train as train_module
 from edge_se_sampler.bench.chart.external import read_external
-from edge_se_sampler.bench.chart.summary import at, comparable, front, over_scenes, table
+from edge_se_sampler.bench.chart.summary import at, comparable, dominating, front, over_scenes, table
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
 from edge_se_sampler.bench.chart.variant import VARIANTS, Cell, cells, changed, config_of
 from edge_se_sampler.data.blender import read_blender
@@ -118,6 +118,13 @@ def test_the_front_names_the_best_at_every_look_and_how_far_the_recommended_one_
     told = {row["seconds"]: row for row in front(runs)}
     assert (told[1]["best"], told[1]["recommended_behind"]) == ("edge", 5)
     assert (told[60]["best"], told[60]["recommended_behind"]) == ("lean", 0)
+
+
+def test_who_is_better_all_the_time_keeps_the_recommended_one_off_the_front() -> None:
+    mine = run_of("lean", "mic", 0, [(1, 20), (7, 25), (60, 30)])
+    for psnrs, expected in (((21, 26, 31), ["edge"]), ((21, 26, 30), []), ((21, 24, 31), [])):
+        theirs = run_of("edge", "mic", 0, list(zip((1, 7, 60), psnrs, strict=True)))
+        assert dominating([mine, theirs]) == expected
 
 
 def test_only_common_scenes_are_compared() -> None:

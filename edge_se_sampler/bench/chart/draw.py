@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.chart.summary import RECOMMENDED, Run, comparable, over_scenes, scenes_of
+from edge_se_sampler.bench.chart.summary import RECOMMENDED, Run, comparable, front, over_scenes, scenes_of
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
 from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
 from edge_se_sampler.show import require_pyplot
@@ -24,7 +24,8 @@ def seconds_of(scale: Scale) -> str:
 
 
 def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale) -> Any:
-    """PSNR over training time of methods and scorings, bands over seeds; other programs dotted."""
+    """PSNR over training time of methods and scorings, bands over seeds; other programs dotted; behind them the front
+    over all variants, named where another one takes over."""
     figure, axis = require_pyplot().subplots(figsize=(8.8, 5.2))
     shown = {name: mine for name, mine in comparable(runs).items() if VARIANTS[name].group in TOP}
     for name, (color, style) in _looks_of(shown).items():
@@ -34,6 +35,7 @@ def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale
         mine = [run for run in program["runs"] if run["scene"] in common]
         if mine:
             _draw_curve(axis, mine, f"{program['name']} ({program['version']})", f"C{(i + 4) % 10}", ":", False)
+    _draw_front(axis, front(runs))
     axis.set(ylabel="test PSNR [dB]")
     axis.set_title(f"mean over {', '.join(sorted(common))}; bands: least to largest of the seeds", fontsize=9)
     _finish(axis, seconds_of(scale))
@@ -131,6 +133,20 @@ def _draw_curve(axis: Any, runs: list[Run], label: str, color: str, style: str, 
     label += f", {failed} of {len(runs)} failed" if failed else ""
     axis.plot(moments, middle, style, color=color, lw=2.6 if strong else 1.3, label=label, zorder=3 if strong else 2)
     axis.fill_between(moments, low, high, color=color, alpha=0.12, lw=0)
+
+
+def _draw_front(axis: Any, told: list[dict[str, Any]]) -> None:
+    axis.plot(
+        [row["seconds"] for row in told], [row["psnr"] for row in told], color="0.85", lw=9, zorder=0, label="front"
+    )
+    before = None
+    for row in told:
+        if row["best"] != before:
+            label, before = VARIANTS[row["best"]].label, row["best"]
+            axis.annotate(
+                label, (row["seconds"], row["psnr"]), (0, 9), textcoords="offset points", fontsize=6, color="0.35",
+                rotation=35,
+            )  # fmt: skip
 
 
 def _finish(axis: Any, label: str) -> None:

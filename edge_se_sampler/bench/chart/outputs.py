@@ -16,7 +16,7 @@ from edge_se_sampler.show import save_figure
 
 
 def write_outputs(result: dict[str, Any], external: Sequence[dict[str, Any]], output_dir: Path) -> None:
-    """The front and other programs in result.json, table.md, pictures and chart.html, of the runs that there are.
+    """result.json with the front and the other programs, table.md, pictures and chart.html, of the runs that there are.
 
     Raises:
         InputError: a file cannot be written, or matplotlib is missing.

@@ -64,6 +64,19 @@ def front(runs: list[Run]) -> list[dict[str, Any]]:
     return told
 
 
+def dominating(runs: list[Run]) -> list[str]:
+    """Variants better than the recommended one at every look that both have: with one, it is off the front."""
+    every = comparable(runs)
+    mine = every.pop(RECOMMENDED)
+    told = []
+    for name, theirs in every.items():
+        pairs = [(over_scenes(mine, look), over_scenes(theirs, look)) for look in LOOKS]
+        known = [(ours, other) for ours, other in pairs if ours is not None and other is not None]
+        if known and all(other > ours for ours, other in known):
+            told.append(name)
+    return told
+
+
 def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     """The table's head, and of every group its variants' rows: PSNR at looks and at the end, failures, costs."""
     looks = [look for look in (3, 7, 20, 60) if any(run["seconds"] > look for run in runs)]
