@@ -127,9 +127,15 @@ def test_who_is_better_all_the_time_keeps_the_recommended_one_off_the_front() ->
         assert dominating([mine, theirs]) == expected
 
 
-def test_only_common_scenes_are_compared() -> None:
+def test_only_common_scenes_and_seeds_are_compared() -> None:
     runs = [run_of("lean", scene, 0, [(1, 20)]) for scene in ("mic", "chair")] + [run_of("edge", "mic", 0, [(1, 9)])]
     assert {run["scene"] for mine in comparable(runs).values() for run in mine} == {"mic"}
+    runs += [run_of("lean", "mic", 1, [(1, 20)]), run_of("rays-128", "chair", 0, [(1, 20)])]
+    assert {name: [run["seed"] for run in mine] for name, mine in comparable(runs, ("methods",)).items()} == {
+        "lean": [0], "edge": [0],
+    }  # fmt: skip
+    assert {run["scene"] for run in comparable(runs, ("size",))["lean"]} == {"chair"}
+    assert comparable(runs) == comparable([]) == {}  # nothing in common, or nothing at all
 
 
 def test_the_table_counts_failures() -> None:

@@ -27,7 +27,7 @@ def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale
     """PSNR over training time of methods and scorings, bands over seeds; other programs dotted; behind them the front
     over all variants, named where another one takes over."""
     figure, axis = require_pyplot().subplots(figsize=(8.8, 5.2))
-    shown = {name: mine for name, mine in comparable(runs).items() if VARIANTS[name].group in TOP}
+    shown = comparable(runs, TOP)
     for name, (color, style) in _looks_of(shown).items():
         _draw_curve(axis, shown[name], VARIANTS[name].label, color, style, name == RECOMMENDED)
     common = {run["scene"] for mine in shown.values() for run in mine}
@@ -48,13 +48,11 @@ def draw_parts(runs: list[Run], scale: Scale) -> Any:
     """The same for what is changed of the recommended method, a panel a kind of change."""
     groups: list[Group] = [group for group in GROUPS if group not in TOP]
     figure, axes = require_pyplot().subplots(1, len(groups), figsize=(4.4 * len(groups), 5.2), sharey=True)
-    every = comparable(runs)
     for axis, group in zip(axes, groups, strict=True):
-        mine = {name: rows for name, rows in every.items() if VARIANTS[name].group == group}
-        for i, (name, rows) in enumerate(mine.items()):
-            _draw_curve(axis, rows, VARIANTS[name].label, f"C{(i + 1) % 10}", "-" if i < 9 else "--", False)
-        if RECOMMENDED in every:
-            _draw_curve(axis, every[RECOMMENDED], VARIANTS[RECOMMENDED].label, "black", "-", True)
+        for i, (name, mine) in enumerate(comparable(runs, (group,)).items()):
+            strong = name == RECOMMENDED
+            color = "black" if strong else f"C{i % 10}"
+            _draw_curve(axis, mine, VARIANTS[name].label, color, "-" if i < 11 else "--", strong)
         axis.set_title(GROUPS[group])
         _finish(axis, seconds_of(scale))
         axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
@@ -66,7 +64,7 @@ def draw_parts(runs: list[Run], scale: Scale) -> Any:
 def draw_costs(runs: list[Run]) -> Any:
     """Methods and scorings: PSNR over how often the networks were asked, and at the end over memory; medians."""
     figure, (asked, memory) = require_pyplot().subplots(1, 2, figsize=(10.4, 4.2), sharey=True)
-    shown = {name: mine for name, mine in comparable(runs).items() if VARIANTS[name].group in TOP}
+    shown = comparable(runs, TOP)
     for name, (color, style) in _looks_of(shown).items():
         strong = name == RECOMMENDED
         for run in shown[name]:

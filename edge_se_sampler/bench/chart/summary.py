@@ -7,7 +7,7 @@ runs ended. The front is, at every moment, the variant that is best then.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,12 +40,16 @@ def over_scenes(runs: list[Run], seconds: float, of_seeds: Callable[[Any], Any] 
     return statistics.mean(float(of_seeds(found)) for found in values.values())
 
 
-def comparable(runs: list[Run]) -> dict[str, list[Run]]:
-    """Variant -> its runs on the scenes that every variant has been trained on."""
-    by_variant = {name: [run for run in runs if run["variant"] == name] for name in VARIANTS}
-    by_variant = {name: mine for name, mine in by_variant.items() if mine}
-    common = set.intersection(*({run["scene"] for run in mine} for mine in by_variant.values()))
-    return {name: [run for run in mine if run["scene"] in common] for name, mine in by_variant.items()}
+def comparable(runs: list[Run], groups: Collection[Group] = tuple(GROUPS)) -> dict[str, list[Run]]:
+    """Variants of some groups, and the recommended one, -> their runs on the scenes and seeds that all of them have."""
+    names = [name for name, variant in VARIANTS.items() if variant.group in groups or name == RECOMMENDED]
+    by_variant = {name: mine for name in names if (mine := [run for run in runs if run["variant"] == name])}
+    if not by_variant:
+        return {}
+    common = set.intersection(*({(run["scene"], run["seed"]) for run in mine} for mine in by_variant.values()))
+    if not common:
+        return {}
+    return {name: [run for run in mine if (run["scene"], run["seed"]) in common] for name, mine in by_variant.items()}
 
 
 def front(runs: list[Run]) -> list[dict[str, Any]]:
@@ -66,31 +70,34 @@ def front(runs: list[Run]) -> list[dict[str, Any]]:
 
 def dominating(runs: list[Run]) -> list[str]:
     """Variants better than the recommended one at every look that both have: with one, it is off the front."""
-    every = comparable(runs)
-    mine = every.pop(RECOMMENDED)
     told = []
-    for name, theirs in every.items():
-        pairs = [(over_scenes(mine, look), over_scenes(theirs, look)) for look in LOOKS]
-        known = [(ours, other) for ours, other in pairs if ours is not None and other is not None]
-        if known and all(other > ours for ours, other in known):
+    for name in {run["variant"] for run in runs} - {RECOMMENDED}:
+        both = comparable([run for run in runs if run["variant"] in (name, RECOMMENDED)])
+        pairs = [(over_scenes(both[RECOMMENDED], look), over_scenes(both[name], look)) for look in LOOKS]
+        known = [(ours, theirs) for ours, theirs in pairs if ours is not None and theirs is not None]
+        if known and all(theirs > ours for ours, theirs in known):
             told.append(name)
-    return told
+    return sorted(told)
 
 
 def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     """The table's head, and of every group its variants' rows: PSNR at looks and at the end, failures, costs."""
     looks = [look for look in (3, 7, 20, 60) if any(run["seconds"] > look for run in runs)]
     head = ["", *(f"{look} s" for look in looks), "end", "failed", "ms a step", "evaluations a step", "memory"]
-    rows: dict[Group, list[list[str]]] = {}
-    for name, mine in comparable(runs).items():
-        rows.setdefault(VARIANTS[name].group, []).append([VARIANTS[name].label, *_fields(mine, looks)])
-    return head, rows
+    told: dict[Group, list[list[str]]] = {}
+    for group in GROUPS:
+        mine = comparable(runs, (group,))
+        if any(VARIANTS[name].group == group for name in mine):
+            told[group] = [[VARIANTS[name].label, *_fields(rows, looks)] for name, rows in mine.items()]
+    return head, told
 
 
 def table(runs: list[Run]) -> str:
     """Markdown of it."""
-    scenes = sorted({run["scene"] for mine in comparable(runs).values() for run in mine})
-    parts = [f"Mean test PSNR in dB over {', '.join(scenes)}, medians over seeds, by seconds of training."]
+    parts = [
+        "Mean over scenes of test PSNR in dB, medians over seeds, by seconds of training; in each table the scenes and "
+        "seeds that all of its variants have."
+    ]
     head, rows = rows_of(runs)
     for group, mine in rows.items():
         lines = [f"| {' | '.join(row)} |" for row in (head, *mine)]
