@@ -12,7 +12,7 @@ import pytest
 
 from edge_se_sampler.bench.chart import train as train_module
 from edge_se_sampler.bench.chart.external import read_external
-from edge_se_sampler.bench.chart.summary import at, comparable, dominating, front, over_scenes, table
+from edge_se_sampler.bench.chart.summary import at, comparable, dominating, front, over_scenes, rows_of_others, table
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
 from edge_se_sampler.bench.chart.variant import VARIANTS, Cell, cells, changed, config_of
 from edge_se_sampler.data.blender import read_blender
@@ -140,9 +140,18 @@ def test_only_common_scenes_and_seeds_are_compared() -> None:
 
 def test_the_table_counts_failures() -> None:
     runs = [run_of("random", "mic", s, [(1, 15), (7.5, 16)], "background" if s else "learnt") for s in range(3)]
-    line = next(line for line in table(runs).splitlines() if line.startswith("| Random"))
+    line = next(line for line in table(runs, []).splitlines() if line.startswith("| Random"))
     assert line.split(" | ")[3:5] == ["16.00", "2 of 3"]
     assert "100.0 | 100 | 1 MiB |" in line
+
+
+def test_other_programs_are_shown_at_the_same_looks() -> None:
+    runs = [run_of("lean", "mic", 0, [(1, 15), (21.5, 16)])]
+    (row,) = rows_of_others(runs, [{**GOOD, "command": "train --fast"}])
+    assert row == ["theirs", "1", "train --fast", "21.00", "21.00", "21.00", "21.00"]
+    lines = table(runs, [GOOD]).splitlines()
+    assert "|  | version | flags | 3 s | 7 s | 20 s | end |" in lines
+    assert "| theirs | 1 | train | 21.00 | 21.00 | 21.00 | 21.00 |" in lines
 
 
 # -- other programs

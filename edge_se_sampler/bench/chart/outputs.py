@@ -26,7 +26,7 @@ def write_outputs(result: dict[str, Any], external: Sequence[dict[str, Any]], ou
     write_result(output_dir / "result.json", result)
     if not runs:
         return
-    write_atomically(output_dir / "table.md", table(runs).encode())
+    write_atomically(output_dir / "table.md", table(runs, external).encode())
     pictures = {
         "chart": draw_chart(runs, external, scale),
         "parts": draw_parts(runs, scale),

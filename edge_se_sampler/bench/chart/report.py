@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.chart.summary import RECOMMENDED, rows_of
+from edge_se_sampler.bench.chart.summary import RECOMMENDED, rows_of, rows_of_others
 from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS
 from edge_se_sampler.bench.page import figure, grid, page
 
@@ -34,9 +34,8 @@ def report(result: dict[str, Any], pictures: Sequence[Path]) -> str:
         [f"{row['seconds']}", escape(VARIANTS[row["best"]].label), f"{row['psnr']:.2f}", _behind(row)]
         for row in result["front"]
     ]
-    others = [
-        [escape(f"{told[key]}") for key in ("name", "version", "command")] for told in result["external"]
-    ]  # fmt: skip
+    others = [[escape(field) for field in row] for row in rows_of_others(result["runs"], result["external"])]
+    top = ("", "version", "flags", *head[1 : head.index("failed")])
     parts = [
         f"<h1>{TITLE}</h1>",
         f"<p>{len(result['runs'])} trainings on made scenes of 100 x 100 pixels. Time runs from reading the data to "
@@ -46,7 +45,7 @@ def report(result: dict[str, Any], pictures: Sequence[Path]) -> str:
         grid(("seconds", "best", "dB", f"{VARIANTS[RECOMMENDED].label} behind it"), front),
         "<h2>Every variant</h2>",
         *tables,
-        *(("<h2>Other programs</h2>", grid(("", "version", "flags"), others)) if others else ()),
+        *(("<h2>Other programs</h2>", grid(top, others)) if others else ()),
         "<h2>Settings</h2>",
         f'<p class="dim">{escape(json.dumps(result["settings"]))} {escape(json.dumps(result["machine"]))}</p>',
     ]

@@ -82,7 +82,7 @@ def dominating(runs: list[Run]) -> list[str]:
 
 def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     """The table's head, and of every group its variants' rows: PSNR at looks and at the end, failures, costs."""
-    looks = [look for look in (3, 7, 20, 60) if any(run["seconds"] > look for run in runs)]
+    looks = _shown_looks(runs)
     head = ["", *(f"{look} s" for look in looks), "end", "failed", "ms a step", "evaluations a step", "memory"]
     told: dict[Group, list[list[str]]] = {}
     for group in GROUPS:
@@ -92,18 +92,41 @@ def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     return head, told
 
 
-def table(runs: list[Run]) -> str:
-    """Markdown of it."""
+def rows_of_others(runs: list[Run], external: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Of every other program its name, version, flags, and PSNR at the same looks and at the end."""
+    chosen = {run["scene"] for mine in comparable(runs, ("methods",)).values() for run in mine}
+    told = []
+    for program in external:
+        mine = [run for run in program["runs"] if run["scene"] in chosen]
+        values = [over_scenes(mine, look) for look in (*_shown_looks(runs), float("inf"))]
+        told.append([*(str(program[key]) for key in ("name", "version", "command")), *map(_shown, values)])
+    return told
+
+
+def table(runs: list[Run], external: Sequence[dict[str, Any]]) -> str:
+    """Markdown of both."""
+    head, rows = rows_of(runs)
+    tables = {GROUPS[group]: (head, mine) for group, mine in rows.items()}
+    if external:
+        looks = head[1 : head.index("failed")]
+        tables["Other programs"] = (["", "version", "flags", *looks], rows_of_others(runs, external))
     parts = [
         "Mean over scenes of test PSNR in dB, medians over seeds, by seconds of training; in each table the scenes and "
         "seeds that all of its variants have."
     ]
-    head, rows = rows_of(runs)
-    for group, mine in rows.items():
-        lines = [f"| {' | '.join(row)} |" for row in (head, *mine)]
-        lines.insert(1, "|---" * len(head) + "|")
-        parts.append(f"**{GROUPS[group]}**\n\n" + "\n".join(lines))
+    for title, (top, mine) in tables.items():
+        lines = [f"| {' | '.join(row)} |" for row in (top, *mine)]
+        lines.insert(1, "|---" * len(top) + "|")
+        parts.append(f"**{title}**\n\n" + "\n".join(lines))
     return "\n\n".join(parts) + "\n"
+
+
+def _shown_looks(runs: list[Run]) -> list[int]:
+    return [look for look in (3, 7, 20, 60) if any(run["seconds"] > 1.05 * look for run in runs)]
+
+
+def _shown(psnr: float | None) -> str:
+    return "–" if psnr is None else f"{psnr:.2f}"
 
 
 def _fields(runs: list[Run], looks: list[int]) -> list[str]:
@@ -115,5 +138,10 @@ def _fields(runs: list[Run], looks: list[int]) -> list[str]:
     step = statistics.median(1000 * (run["seconds"] - run["ready_seconds"]) / run["steps"] for run in runs)
     asked = statistics.median(run["evaluations"] / run["steps"] for run in runs)
     memory = statistics.median(run["peak_bytes"] for run in runs) / 2**20
-    shown = ["–" if value is None else f"{value:.2f}" for value in (*values, end)]
-    return [*shown, f"{failed} of {len(runs)}", f"{step:.1f}", f"{asked:,.0f}", f"{memory:,.0f} MiB"]
+    return [
+        *map(_shown, (*values, end)),
+        f"{failed} of {len(runs)}",
+        f"{step:.1f}",
+        f"{asked:,.0f}",
+        f"{memory:,.0f} MiB",
+    ]
