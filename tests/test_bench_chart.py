@@ -77,7 +77,7 @@ def test_a_run_is_planned_to_fill_its_time_and_is_looked_at_on_the_way(
     assert run["steps"] <= run["planned_steps"]
     assert 0.2 < run["seconds"] < 10  # on a busy machine too
     assert 0 < run["ready_seconds"] < run["curve"][0][0]
-    assert run["peak_bytes"] >= 0
+    assert run["peak_bytes"] > 2**22  # of the trial of its steps too
     assert json.loads(json.dumps(run)) == run
 
 

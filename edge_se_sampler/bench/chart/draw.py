@@ -24,8 +24,8 @@ def seconds_of(scale: Scale) -> str:
 
 
 def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale) -> Any:
-    """PSNR over training time of methods and scorings, bands over seeds; other programs dotted; behind them the front
-    over all variants, named where another one takes over."""
+    """PSNR over training time of methods and scorings, bands over seeds; other programs dotted; their front
+    behind them, named in the order of time."""
     figure, axis = require_pyplot().subplots(figsize=(8.8, 5.2))
     shown = comparable(runs, TOP)
     for name, (color, style) in _looks_of(shown).items():
@@ -35,7 +35,7 @@ def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale
         mine = [run for run in program["runs"] if run["scene"] in common]
         if mine:
             _draw_curve(axis, mine, f"{program['name']} ({program['version']})", f"C{(i + 4) % 10}", ":", False)
-    _draw_front(axis, front(runs))
+    _draw_front(axis, [run for mine in shown.values() for run in mine])
     axis.set(ylabel="test PSNR [dB]")
     axis.set_title(f"mean over {', '.join(sorted(common))}; bands: least to largest of the seeds", fontsize=9)
     _finish(axis, seconds_of(scale))
@@ -74,7 +74,7 @@ def draw_costs(runs: list[Run]) -> Any:
         room = statistics.median(run["peak_bytes"] for run in shown[name]) / MIB
         memory.plot(room, psnr, "*" if strong else "o", color=color, ms=12 if strong else 7, label=label)
     asked.set(xscale="log", xlabel="points that the networks were asked about", ylabel="test PSNR [dB]")
-    memory.set(xscale="log", xlabel="peak memory above the imports' [MiB]")
+    memory.set(xlim=(0, None), xlabel="peak memory above the imports' [MiB]")
     memory.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     for axis in (asked, memory):
         axis.grid(alpha=0.25)
@@ -133,18 +133,13 @@ def _draw_curve(axis: Any, runs: list[Run], label: str, color: str, style: str, 
     axis.fill_between(moments, low, high, color=color, alpha=0.12, lw=0)
 
 
-def _draw_front(axis: Any, told: list[dict[str, Any]]) -> None:
+def _draw_front(axis: Any, shown: list[Run]) -> None:
+    told = front(shown)
+    names = list(dict.fromkeys(VARIANTS[row["best"]].label for row in told))
+    label = f"front: {', then '.join(names)}"
     axis.plot(
-        [row["seconds"] for row in told], [row["psnr"] for row in told], color="0.85", lw=9, zorder=0, label="front"
+        [row["seconds"] for row in told], [row["psnr"] for row in told], color="0.85", lw=9, zorder=0, label=label
     )
-    before = None
-    for row in told:
-        if row["best"] != before:
-            label, before = VARIANTS[row["best"]].label, row["best"]
-            axis.annotate(
-                label, (row["seconds"], row["psnr"]), (0, 9), textcoords="offset points", fontsize=6, color="0.35",
-                rotation=35,
-            )  # fmt: skip
 
 
 def _finish(axis: Any, label: str) -> None:

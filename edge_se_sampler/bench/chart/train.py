@@ -67,10 +67,10 @@ def run_cell(cell: Cell, scale: Scale, data: Path) -> dict[str, Any]:
     """
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         torch.set_num_threads(scale.threads)
+        before = resident_memory()
         config = config_of(cell, data, Path(folder))
         iterations = iterations_within(config, scale)
         config = replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations)
-        before = resident_memory()
         began = scale.clock()
         trainer = prepare(config)
         ready = scale.clock() - began
