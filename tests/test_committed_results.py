@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.bench import demo
+from edge_se_sampler.bench.chart.summary import dominating, front, over_scenes, rows_of, rows_of_others
+from edge_se_sampler.bench.chart.variant import VARIANTS
 from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, Cell, run_cell
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.scenes import made_scenes
@@ -150,6 +152,60 @@ def test_the_readme_quotes_the_map(label: str):
     place = {(row["label"], row["strategy"]): row for row in told["totals"]}
     fields = [f"{place[label, name]['failures']} of {place[label, name]['runs']}" for name in MAPPED]
     assert f"| {label} | " + " | ".join(fields) + " |" in (ROOT / "README.md").read_text()
+
+
+# -- the chart
+
+
+def in_readme(fields: list[str]) -> bool:
+    return f"| {' | '.join(fields)} |" in (ROOT / "README.md").read_text()
+
+
+def test_the_readme_quotes_the_chart():
+    told = result("chart/result.json")
+    head, rows = rows_of(told["runs"])
+    shown = head.index("failed") + 1
+    for group in ("methods", "scorings", "sampling", "economy"):
+        assert all(in_readme(row[:shown]) for row in rows[group]), group
+    for name, _, _, *psnrs in rows_of_others(told["runs"], told["external"]):
+        assert in_readme([name, *psnrs, ""]), name
+    ends = {label: float(psnrs[-1]) for label, *psnrs, _ in (row[:shown] for row in rows["methods"])}
+    (lean, at_end), *six = ends.items()
+    best, best_end = max(six, key=lambda item: item[1])
+    other, *_, other_end = max(rows_of_others(told["runs"], told["external"]), key=lambda row: float(row[-1]))
+    assert (
+        f"{lean} has {rows['methods'][0][1]} dB after 3 CPU seconds and {at_end:.2f} dB within its minute, in which "
+        f"the best of the six strategies ({best}) comes to {best_end:.2f} dB and the best of the other programs "
+        f"({other}) to {other_end} dB"
+    ) in " ".join((ROOT / "README.md").read_text().split())
+    assert "medians of seeds 0, 1, 2" in (ROOT / "README.md").read_text()
+    for name, variant in VARIANTS.items():
+        if variant.group in ("methods", "scorings"):
+            runs = [run for run in told["runs"] if (run["variant"], run["scene"]) == (name, "bricks")]
+            assert sorted(run["seed"] for run in runs) == [0, 1, 2], name
+
+
+def test_lean_nerf_is_on_the_committed_charts_front():
+    told = result("chart/result.json")
+    assert told["front"] == front(told["runs"])
+    assert dominating(told["runs"]) == []
+    ahead = front([run for run in told["runs"] if VARIANTS[run["variant"]].group in ("methods", "scorings")])
+    assert {row["best"] for row in ahead} == {"lean"}
+
+
+@pytest.mark.parametrize(("seconds", "bar"), [(3, 26), (7, 28), (20, 31), (100, 34)])
+def test_lean_nerf_is_as_fast_on_one_core_as_it_should_be_on_two(seconds: float, bar: float):
+    told = result("chart/result.json")
+    assert told["settings"] == {"seconds": 60, "threads": 1}
+    runs = [run for run in told["runs"] if (run["variant"], run["scene"]) == ("lean", "bricks")]
+    assert (over_scenes(runs, seconds) or 0) >= bar
+
+
+def test_the_readme_quotes_the_dense_step():
+    seconds = result("step/result.json")["medians"]
+    theirs = f"one step takes {seconds['theirs']:.1f} s on both cores here"
+    ours = f"and the same step of `vanilla-nerf`, size `paper`, {seconds['ours']:.1f} s"
+    assert f"{theirs}, {ours}" in " ".join((ROOT / "README.md").read_text().split())
 
 
 @pytest.mark.slow

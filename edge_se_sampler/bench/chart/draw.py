@@ -46,9 +46,13 @@ def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale
 
 def draw_parts(runs: list[Run], scale: Scale) -> Any:
     """The same for what is changed of the recommended method, a panel a kind of change."""
-    groups: list[Group] = [group for group in GROUPS if group not in TOP]
-    figure, axes = require_pyplot().subplots(1, len(groups), figsize=(4.4 * len(groups), 5.2), sharey=True)
-    for axis, group in zip(axes, groups, strict=True):
+    trained = {VARIANTS[run["variant"]].group for run in runs}
+    groups: list[Group] = [group for group in GROUPS if group not in TOP and group in trained]
+    figure, axes = require_pyplot().subplots(
+        1, max(1, len(groups)), figsize=(4.4 * max(1, len(groups)), 5.2), sharey=True, squeeze=False
+    )
+    axes = axes[0]
+    for axis, group in zip(axes, groups, strict=False):
         for i, (name, mine) in enumerate(comparable(runs, (group,)).items()):
             strong = name == RECOMMENDED
             color = "black" if strong else f"C{i % 10}"
