@@ -78,7 +78,7 @@ def draw_costs(runs: list[Run]) -> Any:
         room = statistics.median(run["peak_bytes"] for run in shown[name]) / MIB
         memory.plot(room, psnr, "*" if strong else "o", color=color, ms=12 if strong else 7, label=label)
     asked.set(xscale="log", xlabel="points that the networks were asked about", ylabel="test PSNR [dB]")
-    memory.set(xlim=(0, None), xlabel="peak memory above the imports' [MiB]")
+    memory.set(xlim=(0, 1.1 * memory.get_xlim()[1]), xlabel="peak memory above the imports' [MiB]")
     memory.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     for axis in (asked, memory):
         axis.grid(alpha=0.25)
