@@ -20,7 +20,7 @@ from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.scenes import made_scenes
 from edge_se_sampler.bench.paper.tables import alike
 from edge_se_sampler.bench.paper.verdict import failed, verdicts
-from edge_se_sampler.bench.schedule.summary import failures
+from edge_se_sampler.bench.schedule.summary import MARGIN, failures, lengths
 from edge_se_sampler.bench.stability.summary import totals
 
 ROOT = Path(__file__).parent.parent
@@ -136,6 +136,15 @@ def test_the_readme_quotes_the_failures_of_auto():
         f"Of {told['pairs']} pairs Random failed in {told['random']}, `auto` in {told['auto']} (at most "
         f"{100 * most:.1f} % of runs like these, by the 95 % interval)"
     ) in " ".join((ROOT / "README.md").read_text().split())
+
+
+def test_the_readme_quotes_auto_against_the_best_fixed_share():
+    told = result("schedule/result.json")
+    assert told["lengths"] == json.loads(json.dumps(lengths(told["runs"])))
+    for row in told["lengths"]:
+        assert row["low"] > -MARGIN, row["iterations"]
+        difference = f"{row['mean']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"
+        assert in_readme([f"{row['iterations']:,}", row["best"], difference])
 
 
 MAPPED = ("vanilla-nerf", "revived", "precrop-nerf", "edge-se-nerf", "auto", "auto-sharper")
