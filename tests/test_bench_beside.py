@@ -31,6 +31,8 @@ def train():
     assert "--datadir" in sys.argv
     if "--wrong" in sys.argv:
         sys.exit(2)
+    if "--short" in sys.argv:
+        return
     shade = 1 - float(torch.rand(()))  # of its own seed
     while True:
         time.sleep(0.02)
@@ -131,7 +133,9 @@ def test_a_program_is_run_with_each_seed_and_its_curves_are_kept(
         assert path.read_bytes() == before
 
 
-def test_a_program_that_does_not_take_its_flags_is_told_in_one_line(made: Path, tmp_path: Path, edge_se: Any) -> None:
+def test_a_program_that_refuses_its_flags_or_ends_too_soon_is_told_in_one_line(
+    made: Path, tmp_path: Path, edge_se: Any
+) -> None:
     theirs = checkout(tmp_path / "theirs", "run_nerf.py", NERF_PYTORCH)
     (tmp_path / "w" / "scenes").mkdir(parents=True)
     (tmp_path / "w" / "scenes" / "mic").symlink_to(made)
@@ -147,6 +151,7 @@ def test_a_program_that_does_not_take_its_flags_is_told_in_one_line(made: Path, 
     ]
     for more, word in (
         (["--checkout", theirs, "--flags=--wrong"], "SystemExit: 2"),
+        (["--checkout", theirs, "--flags=--short"], "ended by itself after 0 steps"),
         (["--checkout", tmp_path / "none"], "give a git checkout"),
     ):
         answer = edge_se("bench", "beside", *flags, *more)

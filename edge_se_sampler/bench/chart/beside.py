@@ -104,7 +104,7 @@ def run_beside(
         path: of the json; runs that it already has are kept.
 
     Raises:
-        InputError: the program is not there, its flags are refused, or the json is of another one.
+        InputError: the program is not there, refuses its flags or ends too soon, or the json is of another one.
     """
     name = f"{program}, {label}" if label else program
     told = {"name": name, "version": version_of(checkout), "command": f"{program} {flags}".strip(), **asdict(scale)}
@@ -143,6 +143,11 @@ def train(task: Task) -> dict[str, Any]:
         except (Exception, SystemExit) as problem:  # whatever another program raises
             told = f"{type(problem).__name__}: {problem}"
             raise InputError(f"{task.program} with --checkout {task.checkout}, flags {task.flags!r}: {told}") from None
+        else:
+            raise InputError(
+                f"{task.program} ended by itself after {clock.steps} steps, before {task.scale.seconds:g} s were over: "
+                f"ask it for more steps in --flags, now {task.flags!r}"
+            )
     return {"steps": clock.steps, "curve": clock.curve}
 
 
