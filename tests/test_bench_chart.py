@@ -81,6 +81,15 @@ def test_a_run_is_planned_to_fill_its_time_and_is_looked_at_on_the_way(
     assert json.loads(json.dumps(run)) == run
 
 
+@pytest.mark.parametrize("guess", [10, 100_000])
+def test_a_plan_far_from_its_time_is_made_anew(guess: int, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_module, "iterations_within", lambda config, scale: guess)
+    run = run_cell(Cell("lean", "mic", 1), Scale(seconds=1.5), made)
+    assert 20 < run["planned_steps"] < 10_000
+    assert 0.5 < run["steps"] / run["planned_steps"] <= 1
+    assert 0.5 < run["seconds"] < 3  # neither cut early nor after ten steps
+
+
 def test_a_plan_grows_with_its_time(made: Path, tmp_path: Path) -> None:
     config = config_of(Cell("lean", "mic", 0), made, tmp_path)
     short, long = (iterations_within(config, Scale(seconds)) for seconds in (2, 20))

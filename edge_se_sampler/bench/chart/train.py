@@ -35,6 +35,8 @@ LOOKED_AT = 3
 """A look takes every third pixel of each test view; the last one, all."""
 TRIED = 12
 """Steps of the plan's end, the dearer ones, that tell how many will fit; the first few of them do not count."""
+PLAN_OFF = 0.2
+"""A plan that misses its time by more than this share is made anew, once, by how long its steps took."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +71,13 @@ def run_cell(cell: Cell, scale: Scale, data: Path) -> dict[str, Any]:
         torch.set_num_threads(scale.threads)
         before = resident_memory()
         config = config_of(cell, data, Path(folder))
-        iterations = iterations_within(config, scale)
-        config = replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations)
-        began = scale.clock()
-        trainer = prepare(config)
-        ready = scale.clock() - began
-        told = _trained(trainer, ready, scale)
+        told = _planned(config, iterations_within(config, scale), scale)
+        ready = told["ready_seconds"]
+        fits = max(1, round(told["steps"] * (scale.seconds - ready) / (told["seconds"] - ready)))
+        if abs(1 - told["planned_steps"] / fits) > PLAN_OFF:
+            told = _planned(config, fits, scale)
         told["peak_bytes"] = max(0, resident_memory("VmHWM") - before)
-    return {**asdict(cell), "planned_steps": iterations, "ready_seconds": round(ready, 3), **told}
+    return asdict(cell) | told
 
 
 def iterations_within(config: TrainerConfig, scale: Scale) -> int:
@@ -92,6 +93,14 @@ def iterations_within(config: TrainerConfig, scale: Scale) -> int:
             trainer.train_iteration(step)
             times.append(scale.clock() - began)
     return max(TRIED, round((scale.seconds - ready) / statistics.median(times[TRIED // 4 :])))
+
+
+def _planned(config: TrainerConfig, iterations: int, scale: Scale) -> dict[str, Any]:
+    config = replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations)
+    began = scale.clock()
+    trainer = prepare(config)
+    ready = round(scale.clock() - began, 3)
+    return {"planned_steps": iterations, "ready_seconds": ready} | _trained(trainer, ready, scale)
 
 
 def _trained(trainer: Trainer, ready: float, scale: Scale) -> dict[str, Any]:
