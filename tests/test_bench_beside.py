@@ -112,7 +112,7 @@ def test_a_program_is_run_with_each_seed_and_its_curves_are_kept(
     assert answer.code == 0, answer
     answer = edge_se("bench", "beside", *flags, "--flags=--netdepth 4", "--seeds", 0, 1)
     assert answer.code == 0, answer
-    result = read_external(path)
+    result = read_external(path, "--output-path", 2)
     commit = subprocess.run(["git", "-C", theirs, "rev-parse", "HEAD"], capture_output=True, text=True).stdout
     assert (result["name"], result["command"]) == ("nerf-pytorch, small", "nerf-pytorch --netdepth 4")
     assert commit.startswith(result["version"])

@@ -175,7 +175,7 @@ GOOD = {
 def test_other_programs_come_in_as_a_file(tmp_path: Path) -> None:
     path = tmp_path / "theirs.json"
     path.write_text(json.dumps(GOOD))
-    assert read_external(path) == GOOD
+    assert read_external(path, "--external", 1) == GOOD
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,15 @@ def test_a_bad_file_is_refused_in_one_line(bad: Any, tmp_path: Path) -> None:
     path = tmp_path / "theirs.json"
     path.write_text(bad if isinstance(bad, str) else json.dumps(bad))
     with pytest.raises(InputError, match=r"^--external .*theirs.json: not a result"):
-        read_external(path)
+        read_external(path, "--external", 1)
+
+
+def test_seconds_of_another_kind_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "theirs.json"
+    path.write_text(json.dumps({**GOOD, "threads": 2}))
+    assert read_external(path, "--external", 2)["threads"] == 2
+    with pytest.raises(InputError, match=r"theirs.json: timed with 2 threads, not 1"):
+        read_external(path, "--external", 1)
 
 
 # -- the command

@@ -33,7 +33,7 @@ class BenchChart:
     timed by the clock on the wall, so leave the machine alone."""
     external: tuple[Path, ...] = ()
     """Results of other programs, drawn beside: json files with name, version, command, machine, and runs, each with
-    scene, seed and curve, a list of [seconds, PSNR]."""
+    scene, seed and curve, a list of [seconds, PSNR]; threads, if told, must be the chart's."""
     dry_run: tyro.conf.UseCounterAction[int] = 0
     """Only tell which variants there are, and how much is done; trains nothing, writes nothing."""
 
@@ -53,7 +53,7 @@ class BenchChart:
         check_known("variants", self.variants, VARIANTS)
         check_known("scenes", self.scenes, ANALOG_OF)
         _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
-        others = [read_external(path) for path in self.external]
+        others = [read_external(path, "--external", self.threads) for path in self.external]
         scale, path = Scale(self.seconds, self.threads), self.output_dir / "result.json"
         todo, result = cells(self.variants, self.scenes, self.seeds), begun(path, scale)
         if self.dry_run:
