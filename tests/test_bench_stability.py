@@ -16,9 +16,10 @@ from edge_se_sampler.bench import experiment
 from edge_se_sampler.bench.stability import scene
 from edge_se_sampler.bench.stability import train as train_module
 from edge_se_sampler.bench.stability.point import AXES, BASE, PAIRS, STRATEGIES, Cell, Point, cells, points
-from edge_se_sampler.bench.stability.scene import SHIFT, behind, views
+from edge_se_sampler.bench.stability.scene import COLORS, SHIFT, behind, views
 from edge_se_sampler.bench.stability.summary import table, totals
 from edge_se_sampler.bench.stability.train import Measured, Scale, ending, measured, portrait, run_cell, trainer_of
+from edge_se_sampler.edges import edge_strength
 from edge_se_sampler.engine.revival import dead_networks
 from edge_se_sampler.nerf.model import NeRFModel
 
@@ -179,6 +180,17 @@ def test_a_point_is_trained_as_it_says(point: Point, tmp_path: Path) -> None:
     if expected is not None:
         torch.testing.assert_close(outputs["background"], expected(pictures[0].rays(torch.device("cpu"))[:5]))
     assert np.isfinite(trainer.train_iteration(0))
+
+
+@pytest.mark.parametrize("background", ["white", "black", "grey", "green"])
+def test_edges_are_taken_in_front_of_the_points_background(background: Any, tmp_path: Path) -> None:
+    trainer, _ = trainer_of(Point(background=background), "edge-nerf", 3, SMALL, tmp_path)
+    manager = trainer.pipeline.datamanager
+    image = manager.image_batch["image"][0].numpy()
+    edges = edge_strength(image, background=COLORS[background]) + np.float32(0.01)
+    tables = manager.train_pixel_sampler._tables["edge"]
+    drawn = tables.table.probability(tables.place[0]).numpy()
+    np.testing.assert_allclose(drawn, edges / edges.sum(), rtol=1e-3, atol=1e-9)
 
 
 def test_a_run_tells_where_it_stands_and_how_it_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ from edge_se_sampler.bench.stability.scene import COLORS, behind, views
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render_rays
 from edge_se_sampler.engine.files import png_bytes, write_atomically
-from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.revival import dead_networks
 from edge_se_sampler.engine.run_folder import RunFolder
@@ -103,9 +103,10 @@ def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Pat
     )
     train = train.subset(range(point.views))
     config = planned(config, train)
-    pipeline = Pipeline.build(config, train, "cpu")
+    in_front_of = COLORS.get(point.background, COLORS["white"])
+    datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=in_front_of)
+    pipeline = Pipeline(datamanager, build_model(config, "cpu"))
     pipeline.model.background = behind(point.background)
-    pipeline.datamanager.train_pixel_sampler.background = COLORS.get(point.background, COLORS["white"])
     return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), pictures_of(test)
 
 
