@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +15,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge_se_sampler.bench import experiment
 from edge_se_sampler.bench.chart import train as train_module
+from edge_se_sampler.bench.chart.draw import draw_chart, draw_scenes
 from edge_se_sampler.bench.chart.external import read_external
-from edge_se_sampler.bench.chart.summary import at, comparable, dominating, front, over_scenes, rows_of_others, table
+from edge_se_sampler.bench.chart.summary import (
+    at,
+    beside,
+    comparable,
+    dominating,
+    front,
+    over_scenes,
+    rows_of_others,
+    table,
+)
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
 from edge_se_sampler.bench.chart.variant import VARIANTS, Cell, cells, changed, config_of
 from edge_se_sampler.data.blender import read_blender
@@ -200,6 +216,63 @@ def test_seconds_of_another_kind_are_refused(tmp_path: Path) -> None:
     assert read_external(path, "--external", 2)["threads"] == 2
     with pytest.raises(InputError, match=r"theirs.json: timed with 2 threads, not 1"):
         read_external(path, "--external", 1)
+
+
+def test_a_program_stands_beside_us_only_on_our_scenes() -> None:
+    runs = [run_of("lean", scene, 0, [(1, 20), (3, 25)]) for scene in ("mic", "chair")]
+    (told,) = comparable(runs).values()
+    assert beside(GOOD, {"lean": told}) == []  # it has mic alone
+    both = {**GOOD, "runs": [{"scene": s, "seed": 0, "curve": [[1, 20.0]]} for s in ("mic", "chair", "ship")]}
+    assert [run["scene"] for run in beside(both, {"lean": told})] == ["mic", "chair"]
+    assert rows_of_others(runs, [GOOD])[0][3:] == ["–"]
+
+
+def test_curves_of_a_single_look_are_drawn() -> None:
+    runs = [run_of(name, "mic", s, [(1 + s, 20 + s)]) for name in ("lean", "edge") for s in (1, 2)]
+    figure = draw_chart(runs, [], Scale(seconds=2))
+    drawn = [line for line in figure.axes[0].lines if "lean" in str(line.get_label())]
+    np.testing.assert_array_equal(drawn[0].get_xydata(), [[3, 21.5]])
+    labels = [text.get_text() for text in draw_scenes(runs, [], Scale(seconds=2)).legends[0].get_texts()]
+    assert sorted(labels) == ["Edge", "lean-nerf"]  # once each, whatever the seeds
+
+
+# -- processes
+
+
+def test_a_killed_training_is_told_and_costs_no_other(tmp_path: Path) -> None:
+    todo = cells(("lean", "edge", "se"), ("mic", "mic"), (0, 0))
+    result = experiment.begun(tmp_path / "result.json", Scale())
+
+    def train(cell: Cell) -> dict[str, Any]:
+        if cell.variant == "edge":
+            return experiment.alone(os._exit, 1)
+        return {"variant": cell.variant, "scene": cell.scene, "seed": cell.seed}
+
+    experiment.run_cells(todo, result, tmp_path / "result.json", lambda: ThreadPoolExecutor(2), train, lambda _: ())
+    assert [run["variant"] for run in result["runs"]] == ["lean", "se"]  # once each
+    ((error),) = result["errors"]
+    assert (error["variant"], error["error"]) == (
+        "edge", "RuntimeError: its process was killed; is there too little memory?",
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for processes in /proc")
+def test_a_process_of_its_own_ends_with_the_one_that_asked_for_it() -> None:
+    program = "import time; from edge_se_sampler.bench.experiment import alone; alone(time.sleep, 60)"
+    with subprocess.Popen([sys.executable, "-c", program]) as parent:
+        children: list[Path] = []
+        until = time.monotonic() + 60
+        while not children and time.monotonic() < until:
+            time.sleep(0.2)
+            numbers = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+            running = [Path("/proc") / number for number in numbers]
+            children = [place for place in running if b"spawn_main" in (place / "cmdline").read_bytes()]
+        time.sleep(3)  # it imports, and begins to sleep
+        parent.kill()
+    assert children
+    while children[0].exists() and b"spawn_main" in (children[0] / "cmdline").read_bytes():
+        assert time.monotonic() < until + 20, "it goes on"
+        time.sleep(0.2)
 
 
 # -- the command

@@ -51,10 +51,27 @@ def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
     return client.get_executor
 
 
+def alone(train: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+    """What a function returns in a process of its own, which nothing else has grown.
+
+    Raises:
+        RuntimeError: that process was killed.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _end_with_parent) as executor:
+        try:
+            return executor.submit(train, *arguments).result()
+        except BrokenExecutor:
+            raise RuntimeError("its process was killed; is there too little memory?") from None
+
+
 def _begin_worker() -> None:
-    """Ctrl-C reaches every process of a terminal: the one that gives out the work answers it. Should that one be
-    killed, its workers end too instead of waiting for ever."""
+    """Ctrl-C reaches every process of a terminal: the one that gives out the work answers it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_parent()
+
+
+def _end_with_parent() -> None:
+    """Should the process that gives out the work be killed, its workers end too instead of waiting for ever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
@@ -91,7 +108,7 @@ def missing(cells: Sequence[Any], result: dict[str, Any]) -> list[Any]:
     runs = [*result["runs"], *result["errors"]]
     keys = list(asdict(cells[0])) if cells else []
     done = {tuple(run[key] for key in keys) for run in runs}
-    return [cell for cell in cells if tuple(asdict(cell).values()) not in done]
+    return [cell for cell in dict.fromkeys(cells) if tuple(asdict(cell).values()) not in done]
 
 
 def run_cells(
@@ -127,11 +144,14 @@ def run_cells(
                     write_result(path, result)
                     progress.update(len(cells) - len(missing(cells, result)))
             except BrokenExecutor:
+                executor.shutdown(cancel_futures=True)
                 continue
             except BaseException:
                 executor.shutdown(wait=False, cancel_futures=True)
                 raise
         break
+    for cell in missing(cells, result):
+        result["errors"].append({**asdict(cell), "error": "its process, or one beside it, was killed again and again"})
     progress.close()
     write_result(path, result)
 

@@ -34,6 +34,18 @@ def foreground_share(results: dict[str, Any], background: list[dict[str, float |
     return float(np.mean([10 ** ((alone - own) / 10) for own, alone in pairs if own is not None and alone is not None]))
 
 
+def judged(results: dict[str, Any], pictures: list[Picture], shade: float) -> dict[str, Any]:
+    """Of a training by its `evaluate` on pictures: background_psnr, foreground_share and outcome."""
+    background = background_measures(pictures, shade)
+    background_psnr = sum(alone["psnr"] or 0.0 for alone in background) / len(background)
+    share = foreground_share(results, background)
+    return {
+        "background_psnr": background_psnr,
+        "foreground_share": share,
+        "outcome": outcome(results["psnr"], background_psnr, share),
+    }
+
+
 def outcome(psnr: float, background_psnr: float, share: float) -> Outcome:
     """ "background": nothing of the object was learnt; "slow": less than 0.5 dB better than the background alone, or
     worse than it; "learnt" otherwise. The first two are failures."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
+from edge_se_sampler.bench.outcome import judged
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate, shade_behind
 from edge_se_sampler.engine.files import png_bytes
@@ -40,15 +40,10 @@ def trial(config: TrainerConfig) -> dict[str, Any]:
         raise KeyboardInterrupt
     views: list[np.ndarray] = []
     results = evaluate(model, pictures, lambda _, __, rendered: views.append(rendered))
-    background = background_measures(pictures, shade_behind(model))
-    background_psnr = sum(alone["psnr"] or 0.0 for alone in background) / len(background)
-    share = foreground_share(results, background)
     metrics, every = trainer.run.metrics(), trainer.config.steps_per_log
     return {
         **{key: results[key] for key in MEASURES},
-        "background_psnr": background_psnr,
-        "foreground_share": share,
-        "outcome": outcome(results["psnr"], background_psnr, share),
+        **judged(results, pictures, shade_behind(model)),
         "dead_at_start": dead,
         "revived": sum("revived" in line for line in metrics),
         "steps": trainer.next_step,

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import multiprocessing
 import os
 import random
 import shlex
@@ -21,7 +20,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from itertools import product
@@ -33,6 +31,7 @@ import torch
 
 from edge_se_sampler.bench.chart.external import ProgramName, read_external
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
+from edge_se_sampler.bench.experiment import alone
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.evaluation import measures, pictures_of
@@ -117,8 +116,10 @@ def run_beside(
     for seed, scene in product(seeds, scenes):
         if (scene, seed) not in done:
             task = Task(program, checkout, flags, scenes[scene].resolve(), seed, scale)
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
-                measured = alone.submit(train, task).result()
+            try:
+                measured = alone(train, task)
+            except RuntimeError as problem:
+                raise InputError(f"{program} on {scene}, seed {seed}: {problem}") from None
             result["runs"].append({"scene": scene, "seed": seed} | measured)
             write_json(path, result)
     return result

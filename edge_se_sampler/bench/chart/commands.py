@@ -42,9 +42,9 @@ class BenchChart:
 
         from edge_se_sampler.bench.chart.external import read_external
         from edge_se_sampler.bench.chart.outputs import write_outputs
-        from edge_se_sampler.bench.chart.train import Scale, run_in_own_process
+        from edge_se_sampler.bench.chart.train import Scale, run_cell
         from edge_se_sampler.bench.chart.variant import VARIANTS, cells
-        from edge_se_sampler.bench.experiment import begun, default_workers, missing, run_cells
+        from edge_se_sampler.bench.experiment import alone, begun, default_workers, missing, run_cells
         from edge_se_sampler.bench.scoring import scene_in
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_folder
@@ -66,8 +66,8 @@ class BenchChart:
         workers = max(1, default_workers() // self.threads)
         data = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
         run_cells(
-            todo, result, path, lambda: ThreadPoolExecutor(workers), run_in_own_process,
-            lambda cell: (scale, data[cell.scene]),
+            todo, result, path, lambda: ThreadPoolExecutor(workers),
+            lambda cell: alone(run_cell, cell, scale, data[cell.scene]), lambda _: (),
         )  # fmt: skip
         write_outputs(result, others or result.get("external", []), self.output_dir)
         for error in result["errors"]:

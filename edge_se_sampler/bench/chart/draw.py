@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.chart.summary import RECOMMENDED, Run, comparable, front, over_scenes, scenes_of
+from edge_se_sampler.bench.chart.summary import RECOMMENDED, Run, beside, comparable, front, over_scenes, scenes_of
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
 from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
 from edge_se_sampler.show import require_pyplot
@@ -32,8 +32,7 @@ def draw_chart(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale
         _draw_curve(axis, shown[name], VARIANTS[name].label, color, style, name == RECOMMENDED)
     common = {run["scene"] for mine in shown.values() for run in mine}
     for i, program in enumerate(external):
-        mine = [run for run in program["runs"] if run["scene"] in common]
-        if mine:
+        if mine := beside(program, shown):
             _draw_curve(axis, mine, f"{program['name']} ({program['version']})", f"C{(i + 4) % 10}", ":", False)
     _draw_front(axis, [run for mine in shown.values() for run in mine])
     axis.set(ylabel="test PSNR [dB]")
@@ -96,11 +95,13 @@ def draw_scenes(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scal
         rows, columns, figsize=(3.1 * columns, 2.7 * rows), squeeze=False, sharex=True, sharey=True
     )
     shown = {name: v for name, v in VARIANTS.items() if v.group == "methods"}
+    labelled: set[str] = set()
     for axis, scene in zip(axes.ravel(), names, strict=False):
         for name, (color, style) in _looks_of(shown).items():
             for run in (run for run in runs if (run["variant"], run["scene"]) == (name, scene)):
                 x, y = [point[0] for point in run["curve"]], [point[-1] for point in run["curve"]]
-                label = shown[name].label if scene == names[0] and run["seed"] == 0 else None
+                label = shown[name].label if name not in labelled else None
+                labelled.add(name)
                 axis.plot(x, y, style, color=color, lw=1.6 if name == RECOMMENDED else 0.9, label=label)
                 if run["outcome"] != "learnt":
                     axis.plot(x[-1], y[-1], "x", color=color, ms=6)
@@ -126,9 +127,9 @@ def _looks_of(shown: dict[str, Any]) -> dict[str, tuple[str, str]]:
 
 
 def _draw_curve(axis: Any, runs: list[Run], label: str, color: str, style: str, strong: bool) -> None:
-    ends = min(run["curve"][-1][0] for run in runs)
     begins = max(run["curve"][0][0] for run in runs)
-    moments = [begins, *(look for look in LOOKS if begins < look < ends), ends]
+    ends = max(begins, min(run["curve"][-1][0] for run in runs))
+    moments = sorted({begins, *(look for look in LOOKS if begins < look < ends), ends})
     over: list[Callable[[Any], Any]] = [np.min, np.median, np.max]
     low, middle, high = ([over_scenes(runs, moment, of) for moment in moments] for of in over)
     failed = sum(run.get("outcome", "learnt") != "learnt" for run in runs)  # other programs' results tell none

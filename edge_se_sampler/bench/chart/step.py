@@ -21,6 +21,7 @@ from typing import Any, Literal
 from edge_se_sampler.bench.chart.beside import PROGRAMS, Clock, Task, TimeIsUp, version_of
 from edge_se_sampler.bench.chart.train import Scale
 from edge_se_sampler.bench.machine import machine
+from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
@@ -65,7 +66,8 @@ def _ours(pipe: Connection, data: Path, size: Literal["paper", "tiny"], rays: in
     pipeline = replace(config.pipeline, model=model, datamanager=manager)
     with _unseen() as folder:
         turn = _Turn(pipe)
-        trainer = prepare(replace(config, data=data, output_dir=folder, max_num_iterations=1000, pipeline=pipeline))
+        config = replace(config, data=data, output_dir=folder, max_num_iterations=1000, pipeline=pipeline)
+        trainer = prepare(replace(config, machine=MachineConfig(device_type="cpu")))
         turn.begin()
         for step in range(trainer.planned_steps):
             trainer.train_iteration(step)

@@ -1,7 +1,7 @@
 """What the chart's runs say: PSNR against training time, the front, and what each part is worth.
 
-A variant's curve is, at every look, the mean over scenes of the median over seeds; it ends where the slowest of its
-runs ended. The front is, at every moment, the variant that is best then.
+A variant's curve is, at every look, the mean over scenes of the median over seeds; a run that has ended stays at what
+it ended with. The front is, at every moment, the variant that is best then.
 """
 
 from __future__ import annotations
@@ -92,12 +92,19 @@ def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     return head, told
 
 
+def beside(program: dict[str, Any], shown: dict[str, list[Run]]) -> list[Run]:
+    """Another program's runs on the scenes of what is shown; none, where it lacks one of them."""
+    scenes = {run["scene"] for mine in shown.values() for run in mine}
+    mine = [run for run in program["runs"] if run["scene"] in scenes]
+    return mine if scenes == {run["scene"] for run in mine} else []
+
+
 def rows_of_others(runs: list[Run], external: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Of every other program its name, version, flags, and PSNR at the same looks and at the end."""
-    chosen = {run["scene"] for mine in comparable(runs, ("methods",)).values() for run in mine}
+    shown = comparable(runs, ("methods",))
     told = []
     for program in external:
-        mine = [run for run in program["runs"] if run["scene"] in chosen]
+        mine = beside(program, shown)
         values = [over_scenes(mine, look) for look in (*_shown_looks(runs), float("inf"))]
         told.append([*(str(program[key]) for key in ("name", "version", "command")), *map(_shown, values)])
     return told

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
-import multiprocessing
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ import torch
 
 from edge_se_sampler.bench.chart.variant import Cell, config_of
 from edge_se_sampler.bench.machine import resident_memory
-from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
+from edge_se_sampler.bench.outcome import judged
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, evaluate, psnr, render_rays, shade_behind, target_image
 from edge_se_sampler.engine.session import prepare, test_pictures
@@ -35,7 +33,7 @@ LOOKED_AT = 3
 """A look takes every third pixel of each test view; the last one, all."""
 TRIED = 12
 """Steps of the plan's end, the dearer ones, that tell how many will fit; the first few of them do not count."""
-PLAN_OFF = 0.2
+PLAN_OFF = 0.1
 """A plan that misses its time by more than this share is made anew, once, by how long its steps took."""
 
 
@@ -52,12 +50,6 @@ class Scale:
     def clock(self) -> Callable[[], float]:
         """Seconds."""
         return time.process_time if self.threads == 1 else time.perf_counter
-
-
-def run_in_own_process(cell: Cell, scale: Scale, data: Path) -> dict[str, Any]:
-    """`run_cell` in a process that nothing else has grown."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
-        return alone.submit(run_cell, cell, scale, data).result()
 
 
 def run_cell(cell: Cell, scale: Scale, data: Path) -> dict[str, Any]:
@@ -121,11 +113,9 @@ def _trained(trainer: Trainer, ready: float, scale: Scale) -> dict[str, Any]:
             curve.append([round(spent, 3), step + 1, asked, round(results["psnr"], 3)])
         if last:
             break
-    background = background_measures(pictures, shade_behind(model))
-    background_psnr = sum(alone["psnr"] or 0.0 for alone in background) / len(background)
     return {
         "psnr": results["psnr"],
-        "outcome": outcome(results["psnr"], background_psnr, foreground_share(results, background)),
+        "outcome": judged(results, pictures, shade_behind(model))["outcome"],
         "seconds": curve[-1][0],
         "steps": curve[-1][1],
         "evaluations": curve[-1][2],

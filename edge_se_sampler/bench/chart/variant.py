@@ -118,5 +118,5 @@ def config_of(cell: Cell, data: Path, output_dir: Path) -> TrainerConfig:
     config: TrainerConfig = registered_methods()[variant.method].specification.config
     for path, value in variant.changes.items():
         config = changed(config, path, value)
-    machine = MachineConfig(seed=cell.seed)
+    machine = MachineConfig(seed=cell.seed, device_type="cpu")  # seconds are a CPU's
     return replace(config, data=data, output_dir=output_dir, experiment_name=cell.name, machine=machine)
