@@ -17,7 +17,7 @@ import tyro
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.config import LeanModelConfig, check_fineness
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
 
 
@@ -229,12 +229,8 @@ class Inspect:
         from edge_se_sampler.data.blender import read_blender
         from edge_se_sampler.engine.inspection import inspect
 
-        if not 0 <= self.near < self.far < float("inf"):
-            raise InputError(f"--near is {self.near}, --far {self.far}: 0 <= near < far")
-        for flag, value in (("cell-pixels", self.cell_pixels), ("step-cells", self.step_cells)):
-            if not 0 < value < float("inf"):
-                raise InputError(f"--{flag} is {value}: must be above 0")
         asked = LeanModelConfig(near=self.near, far=self.far, cell_pixels=self.cell_pixels, step_cells=self.step_cells)
+        check_fineness(asked)
         print(inspect(read_blender(self.data, "train"), asked, self.output_path))
         print(self.output_path)
 
@@ -250,7 +246,7 @@ class Methods:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure: edge-se bench samplers, quality, paper or nerfstudio."""
+    """Measure samplers and trainings; the experiments behind the README's numbers."""
 
 
 COMMANDS: dict[str, type] = {

@@ -1,4 +1,5 @@
-"""The named methods: the paper's six strategies on NeRF, two on InfoNeRF, and whatever others register. Torch-free.
+"""The named methods: the paper's six strategies on NeRF, two on InfoNeRF, lean-nerf, and whatever others register.
+Torch-free.
 
 A package adds a method with an entry point of the group edge_se_sampler.method_configs that names a
 `protocol.MethodSpecification`.

@@ -15,10 +15,23 @@ from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.data.made.cameras import poses
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerf import economy
 from edge_se_sampler.nerf import hull as hull_module
 from edge_se_sampler.nerf.config import LeanModelConfig
-from edge_se_sampler.nerf.economy import MOST_CELLS, live_pixels, needs
-from edge_se_sampler.nerf.hull import Box, Hull, box_of, carve, footprint, projected, silhouettes
+from edge_se_sampler.nerf.economy import MOST_CELLS, live_pixels, needs, spread_pixels
+from edge_se_sampler.nerf.hull import (
+    AHEAD,
+    AROUND,
+    BEHIND,
+    Box,
+    Hull,
+    box_of,
+    carve,
+    footprint,
+    projected,
+    silhouettes,
+)  # fmt: skip
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 
 VIEWS = 12
@@ -99,12 +112,28 @@ def test_the_box_is_where_the_cameras_look_and_as_large_as_their_depths() -> Non
     assert footprint(moved, box) == pytest.approx(np.median(distance) / 137)
 
 
+@pytest.mark.parametrize("apart", [0.02, -0.005])
+def test_cameras_side_by_side_look_at_what_is_before_them(apart: float) -> None:
+    """Axes that run a little apart meet behind the cameras, or far beyond what is sampled: no middle to build on."""
+    views = views_of(rods(), count=5)
+    turn = np.sin(np.linspace(-apart, apart, 5))
+    ahead = np.stack((turn, np.zeros(5), -np.sqrt(1 - turn**2)), axis=1)
+    right = np.cross(ahead, (0, 1, 0))
+    position = np.stack((np.linspace(-0.5, 0.5, 5), np.zeros(5), np.full(5, 3.0)), axis=1)
+    poses = np.stack((right, np.broadcast_to((0.0, 1.0, 0.0), right.shape), -ahead, position), axis=2)
+    side = replace(views, camera_to_worlds=poses)
+    box = box_of(side, 2, 6)
+    np.testing.assert_allclose(box.middle, (0, 0, -1), atol=0.01)  # 4 ahead of them
+    assert box.half == pytest.approx(2, abs=0.1)
+    assert footprint(side, box) == pytest.approx(4 / 137, rel=0.01)
+
+
 def test_a_rectangle_holds_all_of_its_cell() -> None:
     views, rng = views_of(rods()), np.random.default_rng(1)
     centers, side = rng.uniform(-1.5, 1.5, (500, 3)), 0.4
     for number in range(VIEWS):
-        low, high, ahead = projected(views, number, centers, side)
-        assert ahead.all()
+        low, high, where = projected(views, number, centers, side)
+        assert (where == AHEAD).all()
         pose = views.camera_to_worlds[number]
         worst = []
         for corner in np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3):
@@ -118,8 +147,9 @@ def test_a_rectangle_holds_all_of_its_cell() -> None:
 
 def test_a_cell_around_a_camera_is_not_judged_by_it() -> None:
     views = views_of(rods())
-    _, _, ahead = projected(views, 0, views.camera_to_worlds[:1, :, 3], 0.5)
-    assert not ahead.any()
+    pose = views.camera_to_worlds[0]
+    centers = pose[:, 3] - np.array([[0.0], [1.0], [-1.0]]) * pose[:, 2]
+    assert projected(views, 0, centers, 0.5)[2].tolist() == [AROUND, AHEAD, BEHIND]
 
 
 # -- nothing that is seen goes
@@ -228,6 +258,37 @@ def test_without_a_background_all_that_views_see_is_kept(opaque: bool) -> None:
     assert told.hull.cells.sum() <= 1.3 * MOST_CELLS
 
 
+def test_a_cell_behind_a_camera_is_not_seen_by_it() -> None:
+    """One camera at the side of a box far larger than its depths: half of the cells lie behind it."""
+    views = views_of(rods(), count=1)
+    pose = views.camera_to_worlds[0]
+    hull = carve(views, {}, Box(pose[:, 3], 1.0), 0.1)
+    assert hull is not None
+    centers = hull.corner + (np.argwhere(hull.cells) + 0.5) * hull.side
+    depth = -(centers - pose[:, 3]) @ pose[:, 2]
+    assert depth.min() > -0.1 * np.sqrt(3)
+    assert depth.max() > 1
+
+
+def test_a_sparse_scene_has_no_grid_without_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two specks far apart: few cells, but a box around them that grids keep numbers for."""
+    specks = rods()[-2000:] * 0.02
+    views = views_of(np.concatenate((specks + 0.8, specks - 0.8)), 400)
+    free = needs(views, LeanModelConfig(cell_pixels=0.7)).hull
+    monkeypatch.setattr(economy, "MOST_PLACES", 2**18)
+    bound = needs(views, LeanModelConfig(cell_pixels=0.7)).hull
+    assert free.cells.size > 2**20
+    assert bound.cells.size <= 1.2 * 2**18
+    assert missed(views, bound) == 0
+
+
+def test_cameras_that_see_nothing_are_refused_in_one_line() -> None:
+    views = views_of(rods())
+    aside = replace(views, principal=views.principal + 4000)
+    with pytest.raises(InputError, match=r"no training view sees anything.*principal points"):
+        needs(aside, LeanModelConfig())
+
+
 def test_a_part_that_is_off_does_not_carve() -> None:
     views = views_of(rods())
     carved, whole = (needs(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
@@ -274,6 +335,26 @@ def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
         assert not (meets & ~live.reshape(-1)).any()
         dead += (live.reshape(-1) & ~meets).mean()
     assert 0 < dead / VIEWS < 0.1
+
+
+def test_what_lies_behind_or_beside_an_image_makes_no_pixel_live() -> None:
+    """A cell just before the camera's plane, far to the side, projects to a rectangle of thousands of pixels."""
+    views = views_of(rods())
+    pose = views.camera_to_worlds[0]
+    aside = pose[:, 3] + 30 * pose[:, 0] - 0.2 * pose[:, 2]
+    behind = pose[:, 3] + pose[:, 2]
+    for center in (aside, behind):
+        hull = Hull(center - 0.05, 0.1, np.ones((1, 1, 1), dtype=bool))
+        assert not live_pixels(views, hull)[0].any()
+    close = Hull(pose[:, 3] - 0.08 * pose[:, 2] - 0.05, 0.1, np.ones((1, 1, 1), dtype=bool))
+    assert live_pixels(views, close)[0].all()
+
+
+def test_pixels_are_spread_over_masks_of_any_size() -> None:
+    masks = {3: np.zeros((4, 5), dtype=bool), 1: np.ones((2, 3), dtype=bool), 7: np.eye(3, dtype=bool)}
+    all_of_them = spread_pixels(masks, 100).tolist()
+    assert all_of_them == [[1, r, c] for r in range(2) for c in range(3)] + [[7, i, i] for i in range(3)]
+    assert spread_pixels(masks, 3).tolist() == [[1, 0, 0], [1, 1, 1], [7, 2, 2]]
 
 
 def test_a_camera_inside_of_the_hull_may_train_on_all_its_pixels() -> None:

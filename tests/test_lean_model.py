@@ -20,16 +20,18 @@ from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, prepare
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf import lean
 from edge_se_sampler.nerf.config import LeanModelConfig
 from edge_se_sampler.nerf.economy import live_pixels, needs
 from edge_se_sampler.nerf.hull import Hull
-from edge_se_sampler.nerf.lean import JUDGE_EVERY, JUDGE_FROM, LeanModel
+from edge_se_sampler.nerf.lean import FORGET_AT, JUDGE_EVERY, LeanModel
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 from edge_se_sampler.nerf.ray_model import RayModel
 
 RAYS = 12
+JUDGE_FROM = FORGET_AT + JUDGE_EVERY
 SIDE = 0.3
 
 
@@ -134,6 +136,14 @@ def test_empty_cells_go_and_some_are_tried_again(monkeypatch: pytest.MonkeyPatch
     assert not torch.equal(again, cells(model).occupied)  # others
 
 
+def test_what_was_seen_before_densities_mean_something_does_not_count() -> None:
+    model = model_in(ball()).train()
+    before = int(cells(model).occupied.sum())
+    model.training_loss(tiny_rays(2000), {"image": torch.ones(2000, 3).double()})
+    assert judged(model, FORGET_AT) == before
+    assert judged(model, JUDGE_FROM) < 0.1 * before  # nothing was seen since
+
+
 def test_a_dense_cell_stays() -> None:
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
@@ -183,6 +193,19 @@ def test_a_state_brings_its_cells() -> None:
     rays = tiny_rays(RAYS)
     assert torch.equal(fresh.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
     assert torch.equal(cells(fresh).occupied, cells(model).occupied)
+
+
+def test_a_state_of_other_cells_is_refused() -> None:
+    """As many corners, elsewhere: features would be read at the wrong ones without a word."""
+    model, mirrored = model_in(ball()), ball()
+    one = model_in(replace(mirrored, corner=mirrored.corner + 1e-3))
+    mirrored.cells[0] = False
+    mirrored.cells[0, 4, 4] = True
+    for other in (one, model_in(mirrored)):
+        before = {key: value.clone() for key, value in other.state_dict().items()}
+        with pytest.raises(InputError, match="cells are not the checkpoint's"):
+            other.load_state_dict(model.state_dict())
+        assert all(torch.equal(value, before[key]) for key, value in other.state_dict().items())
 
 
 def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() -> None:
@@ -246,6 +269,10 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
         ("--pipeline.model.cell-pixels", "0", "cell-pixels is 0.0"),
         ("--pipeline.model.step-cells", "nan", "step-cells is nan"),
         ("--pipeline.model.features", "-1", "features is -1"),
+        ("--pipeline.model.features", "100000", "between 0 and 64"),
+        ("--pipeline.model.step-cells", "1e-6", "at least 0.05"),
+        ("--pipeline.model.cell-pixels", "1e300", "at most 1000"),
+        ("--revive", "True", "cannot die"),
         ("--pipeline.datamanager.pixel-sampler.se-scoring", "coarse", "no coarse network"),
     ):
         answer = edge_se(*flags, flag, value)
@@ -279,5 +306,5 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     live = live_pixels(read_blender(larger, "train"), told.hull)
     assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
-    for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf")):
+    for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf"), ("--step-cells", "1e-5")):
         assert edge_se("inspect", "--data", larger, flag, value).code == 2

@@ -75,6 +75,18 @@ def test_no_part_of_a_ray_in_a_cell_is_left_out() -> None:
     assert float((number * step - length).abs().max()) <= step + 1e-9
 
 
+def test_samples_lie_between_the_depths() -> None:
+    rays = tiny_rays(300)
+    grid = grid_of(np.ones((7, 5, 6), dtype=bool))
+    whole, part = (grid.march(rays, 0.02, None, depths) for depths in ((0, np.inf), (3.4, 3.7)))
+    depth = part.t / rays.metadata["directions_norm"][part.ray, 0]
+    assert 3.4 <= float(depth.min()) < 3.43
+    assert 3.67 < float(depth.max()) < 3.7
+    among = whole.t / rays.metadata["directions_norm"][whole.ray, 0]
+    expected = int(((among >= 3.4) & (among < 3.7)).sum())
+    assert len(part.t) == pytest.approx(expected, rel=0.05)
+
+
 def test_rays_that_miss_and_no_rays_have_no_samples() -> None:
     grid, rays = grid_of(cells()), tiny_rays(20)
     away = type(rays)(rays.origins, -rays.directions, rays.camera_indices, rays.metadata)

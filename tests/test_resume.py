@@ -29,7 +29,7 @@ from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
 what, place, data, interrupt_at, method = sys.argv[1:]
 place, data, interrupt_at = Path(place), Path(data), int(interrupt_at)
-lean.JUDGE_FROM = lean.JUDGE_EVERY = 5
+lean.FORGET_AT = lean.JUDGE_EVERY = 5
 if what == "resume":
     trainer = prepare_resume(RunFolder(place))
 else:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.edges import unit_float
 from edge_se_sampler.nerf.config import LeanModelConfig
-from edge_se_sampler.nerf.economy import Needs, live_pixels, needs
+from edge_se_sampler.nerf.economy import Needs, live_pixels, needs, spread_pixels
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 from edge_se_sampler.show import require_pyplot, save_figure
 
@@ -67,8 +66,7 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], step_cells: float)
 
 def _samples(views: Views, told: Needs, live: list[np.ndarray], step: float) -> tuple[float, float]:
     """Samples of a live ray: in the hull, and along the box's whole side; the first a mean over some."""
-    pixels = np.concatenate([np.insert(np.argwhere(mask), 0, i, axis=1) for i, mask in enumerate(live)])
-    chosen = torch.from_numpy(pixels[np.linspace(0, len(pixels) - 1, min(RAYS, len(pixels))).astype(int)])
+    chosen = spread_pixels(dict(enumerate(live)), RAYS)
     samples = OccupancyGrid.of(told.hull).march(RayGenerator(cameras_of(views))(chosen), step, None)
     return len(samples.t) / len(chosen), 2 * told.box.half / step
 

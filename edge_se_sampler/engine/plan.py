@@ -11,6 +11,7 @@ from edge_se_sampler.nerf.config import (
     InfoNeRFModelConfig,
     LeanModelConfig,
     NeRFModelConfig,
+    check_fineness,
     preset_of,
     resolved,
     size_for,
@@ -79,10 +80,7 @@ def _check(plan: TrainerConfig) -> None:
     for flag, frequencies in (("position", model.position_frequencies), ("direction", model.direction_frequencies)):
         if frequencies is None or not 0 <= frequencies <= 24:
             raise InputError(f"--pipeline.model.{flag}-frequencies is {frequencies}: must be between 0 and 24")
-    if not 0 <= model.near < model.far < float("inf"):
-        raise InputError(f"--pipeline.model.near is {model.near}, --pipeline.model.far {model.far}: 0 <= near < far")
-    if not 0 < model.cell_pixels < float("inf"):
-        raise InputError(f"--pipeline.model.cell-pixels is {model.cell_pixels}: must be above 0")
+    check_fineness(model, "pipeline.model.")
     if isinstance(model, InfoNeRFModelConfig):
         _check_info(model)
     if plan.max_seconds is not None and not plan.max_seconds > 0:
@@ -106,11 +104,12 @@ def _check_nerf(model: NeRFModelConfig) -> None:
 
 
 def _check_lean(plan: TrainerConfig, model: LeanModelConfig) -> None:
-    if model.features < 0:
-        raise InputError(f"--pipeline.model.features is {model.features}: must be at least 0")
-    for flag, value in {"step-cells": model.step_cells, "feature-rate": model.feature_rate}.items():
-        if not 0 < value < float("inf"):
-            raise InputError(f"--pipeline.model.{flag} is {value}: must be above 0")
+    if not 0 <= model.features <= 64:
+        raise InputError(f"--pipeline.model.features is {model.features}: must be between 0 and 64")
+    if not 0 < model.feature_rate < float("inf"):
+        raise InputError(f"--pipeline.model.feature-rate is {model.feature_rate}: must be above 0")
+    if plan.revive:
+        raise InputError("--revive: this model's density is never 0, it cannot die; leave the flag out")
     if getattr(plan.pipeline.datamanager.pixel_sampler, "se_scoring", "exact") == "coarse":
         raise InputError("--pipeline.datamanager.pixel-sampler.se-scoring is coarse: this model has no coarse network")
 

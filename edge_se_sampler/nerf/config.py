@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import InstantiateConfig
 
 
@@ -131,6 +132,23 @@ LEAN: dict[str, SizePreset[LeanModelConfig]] = {
     "small": SizePreset(LeanModelConfig("small", 64, 2, 4, 2), 2e-3, 512, 20_000),
     "tiny": SizePreset(LeanModelConfig("tiny", 64, 1, 4, 2), 6e-3, 256, 12_000),
 }
+
+
+def check_fineness(config: ModelConfig, prefix: str = "") -> None:
+    """Refuse depths, cells and steps that no scene can be divided by.
+
+    Args:
+        prefix: of the flags' names.
+
+    Raises:
+        InputError: one is out of its range.
+    """
+    if not 0 <= config.near < config.far < float("inf"):
+        raise InputError(f"--{prefix}near is {config.near}, --{prefix}far {config.far}: 0 <= near < far")
+    if not 0 < config.cell_pixels <= 1000:
+        raise InputError(f"--{prefix}cell-pixels is {config.cell_pixels}: must be above 0, at most 1000")
+    if isinstance(config, LeanModelConfig) and not 0.05 <= config.step_cells < float("inf"):
+        raise InputError(f"--{prefix}step-cells is {config.step_cells}: must be at least 0.05")
 
 
 def size_for(pixels_a_side: int) -> str:

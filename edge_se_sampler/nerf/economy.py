@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -12,12 +13,26 @@ import torch
 from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerf.config import LeanModelConfig, ModelConfig
-from edge_se_sampler.nerf.hull import Box, Hull, Silhouette, box_of, carve, footprint, projected, silhouettes
+from edge_se_sampler.nerf.hull import (
+    AHEAD,
+    AROUND,
+    Box,
+    Hull,
+    Silhouette,
+    box_of,
+    carve,
+    footprint,
+    projected,
+    silhouettes,
+)
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 
 MOST_CELLS = 2**18
 """More would cost more than they tell."""
+MOST_PLACES = 2**24
+"""Cells of the box around them, which grids have a number for, occupied or not."""
 TOLERATED = 0.01
 """Share of the foreground's pixels that may meet no cell, by stray ones."""
 LOOKED_AT = 4096
@@ -39,16 +54,28 @@ class Needs:
 
 
 def needs(views: Views, config: ModelConfig) -> Needs:
-    """Derive what training views need under a resolved config."""
+    """Derive what training views need under a resolved config.
+
+    Raises:
+        InputError: the cameras see nothing of what they look at.
+    """
     by_alpha = config.economy == "auto" and not (isinstance(config, LeanModelConfig) and not config.cull_by_alpha)
     box = box_of(views, config.near, config.far)
     pixel = footprint(views, box)
     shown = silhouettes(views) if by_alpha else {}
     hull = _hull(views, shown, box, config.cell_pixels * pixel)
     if shown and (hull is None or _missed(views, shown, hull) > TOLERATED):
-        print("the views' alpha masks do not agree on where the object is: they carve nothing away", file=sys.stderr)
+        print(
+            "the views' alpha masks do not agree on where the object is, or show too little of it: they carve nothing "
+            "away",
+            file=sys.stderr,
+        )
         shown, hull = {}, _hull(views, {}, box, config.cell_pixels * pixel)
-    assert hull is not None, "cameras see what they look at"
+    if hull is None:
+        raise InputError(
+            "no training view sees anything of what lies between --pipeline.model.near and far around "
+            f"({', '.join(f'{x:.2f}' for x in box.middle)}): check the cameras' poses and principal points"
+        )
     return Needs(box, pixel, len(shown), hull)
 
 
@@ -57,18 +84,29 @@ def _hull(views: Views, shown: dict[int, Silhouette], box: Box, side: float) -> 
     rough = carve(views, shown, box, 2 * box.half / ROUGH)
     if rough is None:
         return None
-    volume = rough.cells.sum() * rough.side**3
-    return carve(views, shown, box, max(side, float(np.cbrt(volume / MOST_CELLS))))
+    volume = max(rough.cells.sum() / MOST_CELLS, rough.cells.size / MOST_PLACES) * rough.side**3
+    return carve(views, shown, box, max(side, float(np.cbrt(volume))))
 
 
 def _missed(views: Views, shown: dict[int, Silhouette], hull: Hull) -> float:
     """Share of the foreground's pixels, or of some of them, whose ray meets no cell."""
-    inside = [np.insert(np.argwhere(views.images[i][..., 3] > 0), 0, i, axis=1) for i in shown]
-    pixels = np.concatenate(inside)
-    some = torch.from_numpy(pixels[np.linspace(0, len(pixels) - 1, min(LOOKED_AT, len(pixels))).astype(int)])
+    some = spread_pixels({i: views.images[i][..., 3] > 0 for i in shown}, LOOKED_AT)
     rays = RayGenerator(cameras_of(views))(some)
     met = OccupancyGrid.of(hull).march(rays, hull.side / 4, None).ray
     return 1 - len(met.unique()) / len(some)
+
+
+def spread_pixels(masks: Mapping[int, np.ndarray], most: int) -> torch.Tensor:
+    """At most so many of the pixels in masks (H, W) of images by number, evenly spread: (n, 3) image, row, column."""
+    counts = [np.count_nonzero(mask) for mask in masks.values()]
+    ends = np.cumsum(counts)
+    chosen = np.linspace(0, ends[-1] - 1, min(most, ends[-1])).astype(int)
+    found = []
+    for (number, mask), count, end in zip(masks.items(), counts, ends, strict=True):
+        mine = chosen[(chosen >= end - count) & (chosen < end)] - (end - count)
+        row, column = np.divmod(np.flatnonzero(mask)[mine], mask.shape[1])
+        found.append(np.stack((np.full(len(mine), number), row, column), axis=1))
+    return torch.from_numpy(np.concatenate(found))
 
 
 def live_pixels(views: Views, hull: Hull) -> list[np.ndarray]:
@@ -78,15 +116,17 @@ def live_pixels(views: Views, hull: Hull) -> list[np.ndarray]:
 
 
 def _covered(views: Views, number: int, centers: np.ndarray, side: float) -> np.ndarray:
-    """Pixels covered by cells: their middles, made as large as the largest of their rectangles."""
+    """Pixels covered by cells: their middles, made as large as the largest of their rectangles; all of them, if a cell
+    is around the camera or as large as the image."""
     height, width = views.images[number].shape[:2]
-    low, high, ahead = projected(views, number, centers, side)
-    if not ahead.all():
+    low, high, where = projected(views, number, centers, side)
+    shown = (where == AHEAD) & ((high > 0) & (low < (width, height))).all(axis=1)
+    low, high = low[shown], high[shown]
+    reach = int(np.ceil((high - low).max(initial=0) / 2)) + 1
+    if (where == AROUND).any() or reach > max(height, width):
         return np.ones((height, width), dtype=bool)
-    reach = int(np.ceil((high - low).max() / 2)) + 1
     column, row = np.floor((low + high) / 2).astype(np.int64).T + reach
     wide = np.zeros((height + 2 * reach, width + 2 * reach), dtype=np.uint8)
-    inside = (row >= 0) & (row < wide.shape[0]) & (column >= 0) & (column < wide.shape[1])
-    wide[row[inside], column[inside]] = 1
-    covered = cv2.dilate(wide, np.ones((2 * reach + 1,) * 2, dtype=np.uint8))
-    return covered[reach : reach + height, reach : reach + width] > 0
+    wide[row, column] = 1
+    count, size = cv2.integral(wide), 2 * reach + 1
+    return count[size:, size:] - count[:-size, size:] - count[size:, :-size] + count[:-size, :-size] > 0

@@ -27,6 +27,8 @@ WITNESSES = 2
 """Views that must see a cell to be empty, where there are as many."""
 FIRST_CELLS = 16
 """Cells along the box when carving begins."""
+AHEAD, AROUND, BEHIND = 1, 0, -1
+"""Where a cell is, seen from a camera's plane."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ class Box:
 
 
 def box_of(views: Views, near: float, far: float) -> Box:
-    """The cube around the point nearest to all optical axes that reaches as far as sampling does, along every axis.
+    """The cube around the point nearest to all optical axes that reaches as far as sampling does, along every axis;
+    where that point is not what is sampled (the axes run side by side, or apart), around the middle of what is.
 
     Args:
         near, far: depths between which rays are sampled, world units.
@@ -81,6 +84,9 @@ def box_of(views: Views, near: float, far: float) -> Box:
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     middle = np.linalg.lstsq(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=None)[0]
     depth = ((middle - position) * ahead).sum(axis=1)
+    if not near < np.median(depth) < far:
+        middle = (position + ahead * (near + far) / 2).mean(axis=0)
+        depth = ((middle - position) * ahead).sum(axis=1)
     return Box(middle, float(np.maximum(far - depth, depth - near).clip(min=0).max()))
 
 
@@ -141,9 +147,10 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
     empty = np.zeros(len(centers), dtype=np.int32)
     seen = np.zeros(len(centers), dtype=bool)
     for number, image in enumerate(views.images):
-        low, high, ahead = projected(views, number, centers, side)
+        low, high, where = projected(views, number, centers, side)
         size = np.array([image.shape[1], image.shape[0]])
-        seen |= ((high > 0) & (low < size)).all(axis=1) | ~ahead
+        ahead = where == AHEAD
+        seen |= ((high > 0) & (low < size)).all(axis=1) & ahead | (where == AROUND)
         if number in shown:
             silhouette = shown[number]
             told = ahead if silhouette.whole else ahead & ((low >= 0) & (high <= size)).all(axis=1)
@@ -152,14 +159,15 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
 
 
 def projected(views: Views, number: int, centers: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rectangles that cells project into: least and greatest u, v (m, 2), and whether a cell is all in front (m,)."""
+    """Rectangles that cells project into: least and greatest u, v (m, 2), and whether each cell is all AHEAD, all
+    BEHIND, or AROUND the camera's plane (m,); only those ahead have a rectangle that means something."""
     pose = views.camera_to_worlds[number]
     x, y, z = ((centers - pose[:, 3]) @ (pose[:, :3] * (1, -1, -1))).T
     half_x, half_y, half_z = side / 2 * np.abs(pose[:, :3]).sum(axis=0)
-    ahead = z > half_z * (1 + 1e-9)
-    z = np.where(ahead, z, half_z + 1)
+    where = np.sign(z) * (np.abs(z) > half_z * (1 + 1e-9))
+    z = np.where(where == AHEAD, z, half_z + 1)
     reach = 1 / (z * (z - half_z))
     off = np.stack(((half_x * z + np.abs(x) * half_z) * reach, (half_y * z + np.abs(y) * half_z) * reach), axis=1)
     at = np.stack((x / z, y / z), axis=1) * views.focal[number] + views.principal[number]
     off = off * views.focal[number]
-    return at - off, at + off, ahead
+    return at - off, at + off, where

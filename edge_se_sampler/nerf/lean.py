@@ -28,8 +28,9 @@ START = -1.0
 """Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient."""
 LARGEST = 8.0
 """Raw density above which a cell is opaque whatever it is."""
-JUDGE_EVERY, JUDGE_FROM = 256, 512
-"""Steps: cells are long enough seen to be judged, and densities have begun to mean something."""
+JUDGE_EVERY, FORGET_AT = 256, 256
+"""Steps: cells are long enough seen to be judged; densities have begun to mean something, what was seen before does
+not count."""
 LEAST_OPACITY = 0.01
 """Of a cell: below, it is taken to be empty."""
 TRIED_AGAIN = 0.02
@@ -125,7 +126,11 @@ class LeanModel(RayModel):
     def begin_step(self, step: int, seed: int) -> None:
         """As `RayModel`; now and then, cells that have shown no density are left out."""
         super().begin_step(step, seed)
-        if self.grid is not None and self._learns_cells and step >= JUDGE_FROM and step % JUDGE_EVERY == 0:
+        if self.grid is None or not self._learns_cells or step % JUDGE_EVERY:
+            return
+        if step == FORGET_AT:
+            self.grid.largest.zero_()
+        elif step > FORGET_AT:
             again = torch.rand(self.grid.possible.shape, generator=self.random, device=self.device) < TRIED_AGAIN
             self.grid.judge(-math.log1p(-LEAST_OPACITY) / float(self.grid.side), again)
 
@@ -139,7 +144,8 @@ class LeanModel(RayModel):
         assert grid is not None, "settle comes first"
         side = float(grid.side)
         step = self.config.step_cells * side
-        samples = grid.march(rays, step, self.uniform(len(rays), 1) if self.training else None)
+        jitter = self.uniform(len(rays), 1) if self.training else None
+        samples = grid.march(rays, step, jitter, (self.config.near, self.config.far))
         positions = samples.positions
         features = positions[:, :0] if self.features is None else self.features(positions)
         centered = (positions - grid.middle) / grid.reach

@@ -87,14 +87,19 @@ class OccupancyGrid(nn.Module):
         """(m,) bool: positions (m, 3) in occupied cells."""
         return self.occupied.reshape(-1)[self.locate(positions)]
 
-    def march(self, rays: RayBundle, step: float, jitter: Tensor | None) -> Samples:
+    def march(
+        self, rays: RayBundle, step: float, jitter: Tensor | None, depths: tuple[float, float] = (0, float("inf"))
+    ) -> Samples:
         """Samples a step apart wherever a ray is in an occupied cell.
 
         Args:
             step: world units.
             jitter: (n, 1) in [0, 1): where in the first step a ray begins; None: in its middle.
+            depths: least and greatest along the camera's axis, world units.
         """
+        norm = rays.metadata["directions_norm"]
         begin, end = self._span(rays)
+        begin, end = torch.maximum(begin, depths[0] * norm), torch.minimum(end, depths[1] * norm)
         longest = float((end - begin).clamp(min=0).max()) if len(rays) else 0.0
         count = int(np.ceil(longest / step)) + 1
         t = begin + (torch.arange(count, device=begin.device) + (0.5 if jitter is None else jitter)) * step

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerf.config import ModelConfig
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 
@@ -67,10 +68,20 @@ class RayModel(nn.Module, ABC):
         self.grid = grid.to(self.device, self.dtype)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
-        """As torch's; a state with cells settles the model in them."""
-        if "grid.possible" in state_dict and self.grid is None:
-            corner, side, possible = (state_dict[f"grid.{key}"] for key in ("corner", "side", "possible"))
-            self.settle(OccupancyGrid(corner, float(side), possible))
+        """As torch's; a state with cells settles the model in them.
+
+        Raises:
+            InputError: the model is settled in other cells: features would lie at other corners.
+        """
+        if "grid.possible" in state_dict:
+            told = {key: state_dict[f"grid.{key}"] for key in ("corner", "side", "possible")}
+            if self.grid is None:
+                self.settle(OccupancyGrid(told["corner"], float(told["side"]), told["possible"]))
+            elif any(not torch.equal(cells.cpu(), getattr(self.grid, key).cpu()) for key, cells in told.items()):
+                raise InputError(
+                    "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
+                    "this machine rounds otherwise; resume with what it began with, or train anew"
+                )
         return super().load_state_dict(state_dict, *args, **kwargs)
 
     def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
