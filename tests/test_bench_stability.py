@@ -172,9 +172,6 @@ def test_a_point_is_trained_as_it_says(point: Point, tmp_path: Path) -> None:
     assert trainer.pipeline.model.config.density_noise == point.noise
     assert trainer.pipeline.datamanager.train_pixel_sampler.watch is not None
     assert trainer.revival is not None
-    for name, epsilon in (("auto", 0.01), ("auto-sharper", 0.001)):
-        sampler = trainer_of(point, name, 3, SMALL, tmp_path)[0].pipeline.datamanager.train_pixel_sampler
-        assert sampler.config.edge_epsilon == epsilon
     outputs = trainer.pipeline.model(pictures[0].rays(torch.device("cpu"))[:5])
     expected = behind(point.background)
     if expected is not None:

@@ -147,7 +147,7 @@ def test_the_readme_quotes_auto_against_the_best_fixed_share():
         assert in_readme([f"{row['iterations']:,}", row["best"], difference])
 
 
-MAPPED = ("vanilla-nerf", "revived", "precrop-nerf", "edge-se-nerf", "auto", "auto-sharper")
+MAPPED = ("vanilla-nerf", "revived", "precrop-nerf", "edge-se-nerf", "auto")
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,6 @@ class Strategy:
     late: str
     schedule: str = "fraction"
     revive: bool = False
-    epsilon: float = 0.01
-    """Of edge sampling: where the object is small, most of its pixels are uniform ones."""
 
 
 STRATEGIES = {
@@ -33,9 +31,6 @@ STRATEGIES = {
     "edge-nerf": Strategy("Edge", "edge", "uniform"),
     "edge-se-nerf": Strategy("Edge + SE", "edge", "se"),
     "auto": Strategy("Edge + SE, auto, dead anew", "edge", "se", schedule="auto", revive=True),
-    "auto-sharper": Strategy(
-        "Edge + SE, auto, dead anew, epsilon 0.001", "edge", "se", schedule="auto", revive=True, epsilon=0.001
-    ),
 }
 """The paper's six, and those that repair."""
 

@@ -89,7 +89,7 @@ def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Pat
     )  # fmt: skip
     config: TrainerConfig = registered_methods()["edge-se-nerf"].specification.config
     settings: dict[str, Any] = {"early": chosen.early, "late": chosen.late, "schedule": chosen.schedule}
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, edge_epsilon=chosen.epsilon, **settings)
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=scale.rays, pixel_sampler=sampler)
     config = replace(
         config,
