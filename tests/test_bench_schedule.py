@@ -128,3 +128,10 @@ def test_nothing_to_do_is_refused(tmp_path: Path, edge_se: Any) -> None:
     answer = edge_se("bench", "schedule", "--output-dir", tmp_path / "o", "--workers", 0)
     assert answer.code == 2
     assert "at least one" in answer.err
+
+
+def test_the_share_is_not_chosen_on_the_seeds_that_are_reported(tmp_path: Path, edge_se: Any) -> None:
+    answer = edge_se("bench", "schedule", "--output-dir", tmp_path / "o", "--length-seeds", 0, 100)
+    assert answer.code == 2
+    assert "chosen on [100]" in answer.err
+    assert not (tmp_path / "o").exists()

@@ -298,6 +298,7 @@ class BenchSchedule(_Parallel):
             Cell,
             Scale,
             choice_cells,
+            choice_seeds,
             failure_cells,
             length_cells,
             run_cell,
@@ -308,6 +309,8 @@ class BenchSchedule(_Parallel):
 
         if not (self.parts and self.failure_seeds and self.length_seeds):
             raise InputError("--parts, --failure-seeds and --length-seeds: give at least one of each")
+        if chosen_on := sorted(set(self.length_seeds) & set(choice_seeds(LENGTHS[0]))):
+            raise InputError(f"--length-seeds: the fixed length is chosen on {chosen_on}; name others")
         workers = self.processes()
         scale, path = Scale(), self.output_dir / "result.json"
         todo = failure_cells(scale, self.failure_seeds) if "failures" in self.parts else []

@@ -57,7 +57,8 @@ def run_cell(cell: Cell, scale: Scale, data: Path) -> dict[str, Any]:
 
     Returns:
         its place, how it ended, seconds, of which it was getting ready, steps, network evaluations, bytes of memory
-        at most above what imports take, and `curve`: seconds, steps, evaluations and mean test PSNR at every look.
+        at most, looks included, above what imports take, and `curve`: seconds, steps, evaluations and mean test PSNR
+        at every look.
     """
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         torch.set_num_threads(scale.threads)
