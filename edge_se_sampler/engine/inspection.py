@@ -38,15 +38,15 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     _draw_views(axes[1], views, live)
     figure.tight_layout()
     save_figure(figure, path)
-    return "\n".join(_lines(views, told, live, config.step_cells))
+    return "\n".join(_lines(views, told, live, config))
 
 
-def _lines(views: Views, told: Needs, live: list[np.ndarray], step_cells: float) -> list[str]:
+def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelConfig) -> list[str]:
     """One a finding: the quantity, its value, and where it comes from."""
     hull, box = told.hull, told.box
     sizes = sorted({image.shape[1::-1] for image in views.images})
     whole = (2 * box.half / hull.side) ** 3
-    samples, along = _samples(views, told, live, step_cells * hull.side)
+    samples, along = _samples(views, told, live, config)
     distance = np.linalg.norm(views.camera_to_worlds[:, :, 3] - box.middle, axis=1)
     at = ", ".join(f"{value + 0.0:.2f}" for value in box.middle.round(2))
     across = np.mean(np.concatenate([pixels.ravel() for pixels in live]))
@@ -64,10 +64,12 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], step_cells: float)
     return [f"{name:<13}{what}" for name, what in said.items()]
 
 
-def _samples(views: Views, told: Needs, live: list[np.ndarray], step: float) -> tuple[float, float]:
+def _samples(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelConfig) -> tuple[float, float]:
     """Samples of a live ray: in the hull, and along the box's whole side; the first a mean over some."""
+    step = config.step_cells * told.hull.side
     chosen = spread_pixels(dict(enumerate(live)), RAYS)
-    samples = OccupancyGrid.of(told.hull).march(RayGenerator(cameras_of(views))(chosen), step, None)
+    rays = RayGenerator(cameras_of(views))(chosen)
+    samples = OccupancyGrid.of(told.hull).march(rays, step, None, (config.near, config.far))
     return len(samples.t) / len(chosen), 2 * told.box.half / step
 
 
