@@ -28,7 +28,7 @@ START = -1.0
 """Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient."""
 LARGEST = 8.0
 """Raw density above which a cell is opaque whatever it is."""
-JUDGE_EVERY, FORGET_AT = 256, 256
+JUDGE_EVERY, FORGET_AT = 128, 128
 """Steps: cells are long enough seen to be judged; densities have begun to mean something, what was seen before does
 not count."""
 LEAST_OPACITY = 0.01
