@@ -29,7 +29,9 @@ from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_sce
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made.folder import make_scenes
 from edge_se_sampler.engine.evaluation import measures, pictures_of
+from edge_se_sampler.engine.run_folder import config_from_json, config_to_json
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf.config import InfoNeRFModelConfig
 
 SMALL = Preset("tiny", iterations=4, info_iterations=3, rays=16, image_size=16, num_train=11, num_test=1)
@@ -214,6 +216,34 @@ def test_ctrl_c_is_for_the_one_that_gives_out_the_work() -> None:
         assert executor.submit(interrupts_itself).result() == 7
 
 
+def interrupts_its_parent_and_works_on(cell: Cell, *_: Any) -> dict[str, Any]:
+    os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(60)
+    return {}
+
+
+def test_ctrl_c_waits_for_no_cell(experiment: Any) -> None:
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        experiment(TWO_CELLS, interrupts_its_parent_and_works_on, running.executor_of(1, None))
+    assert time.monotonic() - began < 40
+
+
+class OnlyWaits(ThreadPoolExecutor):
+    """As dask's executor: it can cancel futures, not all at once."""
+
+    def shutdown(self, wait: bool = True) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().shutdown(wait=wait)
+
+
+def test_an_executor_that_only_waits_is_left_in_good_order(experiment: Any) -> None:
+    def interrupted(*_: Any) -> dict[str, Any]:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        experiment(TWO_CELLS, interrupted, lambda: OnlyWaits(1))
+
+
 GIVES_OUT_WORK = """
 import os, time
 from edge_se_sampler.bench.experiment import executor_of
@@ -243,13 +273,28 @@ def test_workers_do_not_outlive_the_one_that_gave_out_the_work(tmp_path: Path) -
     raise AssertionError(f"worker {worker} is still there")
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[]", '{"version": 0, "settings": {}, "runs": []}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "{}", "[]", '{"version": 0, "settings": {}, "runs": []}',
+        '{"version": 1, "settings": {}, "runs": 3, "errors": []}',
+        '{"version": 1, "settings": {}, "runs": [7], "errors": []}',
+    ],
+)  # fmt: skip
 def test_another_result_is_neither_continued_nor_overwritten(content: str, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     path.write_text(content)
     with pytest.raises(InputError, match=r"result\.json"):
         running.begun(path, SMALL)
     assert path.read_text() == content
+
+
+def test_a_cells_run_can_be_taken_up_again(tmp_path: Path) -> None:
+    for table in TABLES:
+        cell = next(cell for cell in cells((table,), ("mic",), (), (0,)))
+        config = config_of(cell, SMALL, tmp_path, tmp_path)
+        default = registered_methods()[config.method_name].specification.config
+        assert config_from_json(default, config_to_json(config), "here") == config
 
 
 def test_a_result_of_another_preset_is_refused(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from blender_folder import ANGLE, HEIGHT, WIDTH, chunk, pixels, png, pose, write_json, write_scene
 
 from edge_se_sampler.data.blender import has_split, read_blender
+from edge_se_sampler.errors import InputError
 
 
 @pytest.fixture
@@ -168,10 +169,23 @@ def test_what_no_frame_lists_is_not_looked_at(tmp_path: Path) -> None:
     doc = write_scene(tmp_path, split="test")
     (tmp_path / "test/r_0_depth_0001.png").write_bytes(b"no image")
     (tmp_path / "test/r_0_normal_0001.png").mkdir()
-    doc |= {"aabb_scale": [4, None], "k1": "?"}
+    doc |= {"aabb_scale": [4, None], "offset": "?"}
     doc["frames"][0]["time"] = {"unknown": True}
     write_json(tmp_path, doc, "test")
     assert len(read_blender(tmp_path, "test").images) == 3
+
+
+@pytest.mark.parametrize("place", ["file", "frame"])
+def test_lens_distortion_is_refused_unless_it_is_none(place: str, tmp_path: Path) -> None:
+    doc = write_scene(tmp_path, split="test")
+    parent = doc if place == "file" else doc["frames"][1]
+    parent |= {"k1": 0, "p2": 0.0}
+    write_json(tmp_path, doc, "test")
+    assert len(read_blender(tmp_path, "test").images) == 3
+    parent["k1"] = 0.3
+    write_json(tmp_path, doc, "test")
+    with pytest.raises(InputError, match=r"k1: is 0\.3, but rays here know no lens distortion"):
+        read_blender(tmp_path, "test")
 
 
 def test_poses_as_rounded_in_files_are_kept_as_written(tmp_path: Path, doc: dict[str, Any]) -> None:

@@ -97,6 +97,7 @@ SETTINGS = [
     (["--max-num-iterations", "many"], "--max-num-iterations"),
     (["--max-num-iterations", "0"], "--max-num-iterations"),
     (["--max-seconds", "nan"], "--max-seconds"),
+    (["--max-seconds", "inf"], "--max-seconds"),
     (["--optimizer.lr", "-1"], "--optimizer.lr"),
     (["--pipeline.model.near", "7"], "near"),
     (["--pipeline.model.depth", "0"], "depth"),
@@ -183,6 +184,9 @@ class TestRuns:
             (lambda c: c.update(surprise=1), "surprise"),
             (lambda c: c.update(method_name="gone"), "method_name"),
             (lambda c: c["pipeline"].update(model=3), "model"),
+            (lambda c: c["machine"].update(seed="a"), "seed"),
+            (lambda c: c.update(steps_per_log=1.5), "steps_per_log"),
+            (lambda c: c.update(data=None), "held-out"),
         ],
     )
     def test_with_a_config_of_another_version(self, run: Path, edge_se, change, named: str):
@@ -199,6 +203,34 @@ class TestRuns:
         assert "--output-path" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "no" / "e.json")
         assert ".gif or .mp4" in refused(edge_se, run, "render", run, "--output-path", tmp_path / "x.avi")
         assert "--num-frames" in refused(edge_se, run, "render", run, "--num-frames", 0)
+        for path in (".", tmp_path):
+            assert "must name a file" in refused(edge_se, run, "eval", run, "--output-path", path)
+
+    def test_with_damaged_metrics(self, run: Path, edge_se):
+        for content in ('{"loss": 1}\n', "no json\n", '{"step": "a"}\n'):
+            (run / "metrics.jsonl").write_text(content)
+            assert "metrics.jsonl: damaged" in refused(edge_se, run, "resume", run)
+
+    @pytest.mark.parametrize("seconds", ["-5", "0", "nan", "inf"])
+    def test_a_session_of_no_length(self, run: Path, edge_se, seconds: str):
+        assert "--max-seconds" in refused(edge_se, run, "resume", run, "--max-seconds", seconds)
+
+
+@pytest.mark.parametrize("command", ["show", "inspect"])
+def test_pictures_that_cannot_be(command: str, scene: Path, tmp_path: Path, edge_se):
+    for path in (".", tmp_path, tmp_path / "no" / "x.png"):
+        assert "--output-path" in refused(edge_se, tmp_path, command, "--data", scene, "--output-path", path)
+    if command == "show":
+        flags = ["--data", scene, "--output-path", tmp_path / "x.png", "--pixel-sampler.num-rays-per-batch", -5]
+        assert "num-rays-per-batch is -5" in refused(edge_se, tmp_path, "show", *flags)
+
+
+def test_too_little_memory_is_told_in_one_line(scene: Path, tmp_path: Path, edge_se):
+    flags = ["--data", scene, "--output-dir", tmp_path / "o", "--pipeline.model.width", 10**7]
+    answer = edge_se("train", "vanilla-nerf", *flags)
+    assert answer.code == 2
+    assert "not enough memory" in answer.err
+    assert answer.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("previews", [1, 100])

@@ -21,6 +21,7 @@ from edge_se_sampler.bench.paper.scenes import made_scenes
 from edge_se_sampler.bench.paper.tables import alike
 from edge_se_sampler.bench.paper.verdict import failed, verdicts
 from edge_se_sampler.bench.schedule.summary import MARGIN, failures, lengths
+from edge_se_sampler.bench.stability.point import STRATEGIES as MAP_STRATEGIES
 from edge_se_sampler.bench.stability.summary import totals
 
 ROOT = Path(__file__).parent.parent
@@ -161,6 +162,23 @@ def test_the_readme_quotes_the_map(label: str):
     place = {(row["label"], row["strategy"]): row for row in told["totals"]}
     fields = [f"{place[label, name]['failures']} of {place[label, name]['runs']}" for name in MAPPED]
     assert f"| {label} | " + " | ".join(fields) + " |" in (ROOT / "README.md").read_text()
+
+
+def test_the_readme_tells_how_many_of_the_map_failed():
+    runs = result("stability/result.json")["runs"]
+    lost = {name: sum(r["strategy"] == name and r["outcome"] != "learnt" for r in runs) for name in MAP_STRATEGIES}
+    assert {sum(r["strategy"] == name for r in runs) for name in MAP_STRATEGIES} == {240}
+    text = " ".join((ROOT / "README.md").read_text().split())
+    for words in (
+        f"Random and SE die almost everywhere, {lost['vanilla-nerf']} and {lost['se-nerf']} of 240 runs",
+        f"what killed them goes on ({lost['revived']} failed)",
+        f"not too small ({lost['precrop-nerf']})",
+        f"Edge + SE loses {lost['edge-se-nerf']}:",
+        f"with dead networks begun anew, {lost['auto']} failed: five",
+    ):
+        assert words in text, words
+    small = [r for r in runs if r["strategy"] == "auto" and r["outcome"] != "learnt" and r.get("foreground", 1) <= 0.02]
+    assert len(small) == 5
 
 
 # -- the chart

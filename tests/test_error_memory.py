@@ -153,9 +153,9 @@ def test_the_early_phase_fills_the_memory() -> None:
     assert np.count_nonzero(sampler.memory.seen) > 50
 
 
-@pytest.mark.parametrize(("late", "scoring"), [("uniform", "memory"), ("se", "exact")])
-def test_others_remember_nothing(late: Any, scoring: Any) -> None:
-    sampler = following(LATE, late=late, se_scoring=scoring)
+@pytest.mark.parametrize("late", ["uniform", "se"])
+def test_others_remember_nothing(late: Any) -> None:
+    sampler = following(LATE, late=late)
     sampler.sample(batch_of())
     sampler.observe(torch.ones(64))
     assert sampler.memory is None

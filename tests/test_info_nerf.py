@@ -202,15 +202,17 @@ def test_unseen_rays_are_asked_for_their_entropy() -> None:
 def test_the_gain_is_added_to_seen_and_unseen_rays_and_off_by_default() -> None:
     batch = {"image": torch.rand(6, 3).double()}
 
-    def losses(weight: float) -> tuple[Tensor, Tensor]:
-        model = info_model(gain_weight=weight, entropy_weight=0.0).train()
+    def losses(weight: float, **changes: Any) -> tuple[Tensor, Tensor]:
+        model = info_model(gain_weight=weight, entropy_weight=0.0, **changes).train()
         with torch.no_grad():
             model.fine.density.bias.add_(1)
         model.begin_step(0, seed=1)
         model.random.manual_seed(1)  # the gain's turn has moved it on
         return model.training_loss(tiny_rays(6), batch)[0].detach(), model.unseen_loss(tiny_rays(6)).detach()
 
+    alone, _ = losses(3.0, num_unseen_rays=0)
     (seen, unseen), (plain, nothing) = losses(3.0), losses(0.0)
+    torch.testing.assert_close(alone - plain, 2 * (seen - plain))  # half of it falls to the unseen rays, if any
     assert (seen - plain).min() > -1e-9
     assert (seen - plain).max() > 1e-4
     assert unseen.max() > 1e-4

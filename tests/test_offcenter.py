@@ -188,7 +188,7 @@ class TestCameras:
 class TestJson:
     def test_order_names_poses_and_further_keys_stay(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")
-        doc |= {"aabb_scale": [4, None], "k1": "?", "frames": doc["frames"][::-1]}
+        doc |= {"aabb_scale": [4, None], "offset": "?", "frames": doc["frames"][::-1]}
         doc["frames"][0] |= {"time": {"unknown": True}, "file_path": "train/../train/r_2"}
         write_json(tmp_path / "scene", doc)
         for folder in offcenter(tmp_path / "scene", tmp_path / "out"):

@@ -17,10 +17,14 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     *[("early-fraction", {"early_fraction": value}) for value in (-0.01, 1.01, NAN)],
     *[("early-steps", {"schedule": "steps", "early_steps": value}) for value in (0, -1)],
     ("early-steps", {"early_steps": 100}),  # schedule "fraction"
-    *[("edge-epsilon", {"edge_epsilon": value}) for value in (0, -1e-3, INF, NAN)],
+    *[("edge-epsilon", {"edge_epsilon": value}) for value in (0, -1e-3, 1e-7, 1e7, INF, NAN)],
     *[("se-candidates", {"se_candidates": value}) for value in (1, 0, -2)],
     *[("importance-weight", {"importance_weight": value}) for value in (-0.1, 1.1, NAN)],
-    ("importance-weight", {"importance_weight": 0.5, "early": "uniform", "late": "uniform"}),
+    *[
+        ("importance-weight", {"importance_weight": 0.5, "early": early, "late": "uniform"})
+        for early in ("uniform", "precrop")
+    ],
+    *[("se-scoring", {"se_scoring": scoring, "late": "uniform"}) for scoring in ("coarse", "memory")],
 ]
 
 
@@ -48,7 +52,8 @@ def test_a_sampler_refuses_them_when_it_is_made(flag: str, settings: dict[str, A
         {"early_fraction": 1},
         {"schedule": "steps", "early_steps": 1},
         {"schedule": "auto"},
-        {"edge_epsilon": 1e-30},
+        {"edge_epsilon": 1e-6},
+        {"edge_epsilon": 1e6},
         {"se_candidates": 2},
         {"importance_weight": 1.0},
         {"importance_weight": 0.5, "early": "uniform"},

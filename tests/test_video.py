@@ -44,6 +44,12 @@ def test_mp4_without_its_extra_is_refused_by_the_extras_name(tmp_path: Path, mon
     check_video(tmp_path / "turn.GIF", 20)  # which needs none
 
 
+def test_a_gifs_frames_stand_for_the_nearest_hundredth_of_a_second(tmp_path: Path) -> None:
+    for rate, milliseconds in ((30, 30), (45, 20), (24, 40), (15, 70)):
+        write_video(tmp_path / "turn.gif", FRAMES, rate)
+        assert iio.immeta(tmp_path / "turn.gif")["duration"] == milliseconds
+
+
 @pytest.mark.parametrize("name", ["turn.avi", "turn", "turn.gif.png"])
 def test_other_endings_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"must end in \.gif or \.mp4"):
