@@ -199,10 +199,16 @@ class Show:
 
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.show import show
 
         if self.num_views < 1:
             raise InputError(f"--num-views is {self.num_views}: must be at least 1")
+        if self.pixel_sampler.num_rays_per_batch < 1:
+            raise InputError(
+                f"--pixel-sampler.num-rays-per-batch is {self.pixel_sampler.num_rays_per_batch}: must be at least 1"
+            )
+        check_output(self.output_path)
         views = read_blender(self.data, "train")
         show(views, self.pixel_sampler, self.strategy, self.output_path, self.num_views, self.seed)
         print(self.output_path)
@@ -227,8 +233,10 @@ class Inspect:
 
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.engine.inspection import inspect
 
+        check_output(self.output_path)
         asked = LeanModelConfig(near=self.near, far=self.far, cell_pixels=self.cell_pixels, step_cells=self.step_cells)
         check_fineness(asked)
         print(inspect(read_blender(self.data, "train"), asked, self.output_path))
@@ -272,6 +280,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _leave(str(problem), 2)
     except FloatingPointError as problem:
         _leave(str(problem), 1)
+    except (MemoryError, RuntimeError) as problem:
+        if isinstance(problem, RuntimeError) and "alloc" not in str(problem):
+            raise
+        _leave("there is not enough memory for this; ask for fewer rays, or a smaller model", 2)
     except KeyboardInterrupt:
         _leave("interrupted", 130)
 

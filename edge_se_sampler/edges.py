@@ -2,7 +2,7 @@
 
 I    image, (H, W, 3|4), uint8 or float in [0, 1], sRGB, straight alpha
 G    gray: the colour composited on the background, BT.601 luma, in [0, 1]
-phi  edge operator with replicated borders, scaled so that a full-contrast step edge answers 1
+phi  edge operator with replicated borders, scaled so that a full-contrast step edge along an axis answers 1
 E    edge strength, (H, W) float32, finite, >= 0
 """
 

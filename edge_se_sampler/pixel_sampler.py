@@ -208,7 +208,10 @@ class ImportantPixels:
         numbers = batch.numbers.tolist()
         new = [k for k, number in enumerate(numbers) if number not in tables.place]
         if new:
-            tables.table.add(in_threads(lambda k: self._valid_strength(batch, strategy, k), new))
+            try:
+                tables.table.add(in_threads(lambda k: self._valid_strength(batch, strategy, k), new))
+            except ValueError as problem:
+                raise InputError(str(problem)) from problem
             tables.place.update({numbers[k]: len(tables.place) + i for i, k in enumerate(new)})
         return tables.table, torch.tensor([tables.place[number] for number in numbers])
 

@@ -65,14 +65,16 @@ class SamplingSettings:
             refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
         if self.schedule == "auto" and self.early != "edge":
             refuse("schedule", "'auto' asks whether edges pay: it needs early edge")
-        if not 0 < self.edge_epsilon < float("inf"):
-            refuse("edge_epsilon", "must be above 0 (0 would never train flat regions)")
+        if not 1e-6 <= self.edge_epsilon <= 1e6:
+            refuse("edge_epsilon", "must be between 1e-6 and 1e6 (less would never train flat regions)")
         if self.se_candidates < 2:
             refuse("se_candidates", "must be at least 2, or there is nothing to choose from")
         if not 0 <= self.importance_weight <= 1:
             refuse("importance_weight", "must be between 0 and 1")
-        if self.importance_weight and (self.early, self.late) == ("uniform", "uniform"):
-            refuse("importance_weight", "has no effect when every pixel is drawn alike")
+        if self.importance_weight and self.early != "edge" and self.late == "uniform":
+            refuse("importance_weight", "has no effect when all that are drawn are drawn alike")
+        if self.se_scoring != "exact" and self.late != "se":
+            refuse("se_scoring", "has no effect without late se")
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run planned for that many; under "auto" nobody knows."""

@@ -17,6 +17,7 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.image_batch import ImageBatch
 from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.streams import Stream, stream
 
 
 def probability_map(sampler: EdgeSEPixelSampler, batch: ImageBatch, strategy: str, k: int) -> np.ndarray:
@@ -49,7 +50,7 @@ def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Pa
             p = probability_map(sampler, batch, strategy, k)
         except ValueError as problem:
             raise InputError(f"{views.names[k]}: {problem}") from problem
-        _show_view(row, views, k, p, strategy, config.num_rays_per_batch, np.random.default_rng((seed, k)))
+        _show_view(row, views, k, p, strategy, config.num_rays_per_batch, stream(seed, k, Stream.PIXELS))
     figure.tight_layout()
     save_figure(figure, path)
 

@@ -30,10 +30,11 @@ class BenchSamplers:
 
     def run(self) -> None:
         from edge_se_sampler.bench.samplers import bench_samplers, table_of
-        from edge_se_sampler.engine.files import make_folder, write_json
+        from edge_se_sampler.engine.files import check_output, make_folder, write_json
 
         if self.output_path is not None:
             make_folder(self.output_path.parent, "--output-path, folder")
+            check_output(self.output_path)
         if min(self.images, self.size, self.draws, self.repeats) < 1:
             raise InputError("--images, --size, --draws and --repeats must be at least 1")
         result = bench_samplers(self.images, self.size, self.draws, self.repeats)
@@ -65,13 +66,14 @@ class BenchScoring:
     def run(self) -> None:
         from edge_se_sampler.bench.scoring import bench_scoring, scene_in, table_of
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
-        from edge_se_sampler.engine.files import make_folder, write_json
+        from edge_se_sampler.engine.files import check_output, make_folder, write_json
 
         check_known("scene", (self.scene,), ANALOG_OF)
         if min(self.rays, self.rounds, self.learning) < 1:
             raise InputError("--rays, --rounds and --learning must be at least 1")
         if self.output_path is not None:
             make_folder(self.output_path.parent, "--output-path, folder")
+            check_output(self.output_path)
         data = scene_in(self.workplace, self.scene)
         result = bench_scoring(data, self.size, self.rays, self.rounds, self.learning)
         print(table_of(result))
@@ -127,6 +129,8 @@ class BenchNerfstudio:
     def run(self) -> None:
         from edge_se_sampler.bench.nerfstudio import bench_nerfstudio
 
+        if not self.seeds or min(self.iterations, self.rays, self.samples) < 1:
+            raise InputError("--seeds, --iterations, --rays and --samples: at least one of each")
         result = bench_nerfstudio(
             self.output_dir, self.workplace, self.scene, self.seeds, self.iterations, self.rays, self.samples
         )
@@ -144,7 +148,8 @@ class _Parallel:
     workers: int | None = None
     """Trainings at once, a thread each; left out, as many as there are cores, or one where there is a GPU."""
     scheduler: str | None = None
-    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers."""
+    """Address of a dask scheduler whose workers take them ([cluster] extra), instead of --workers; start those with
+    one thread each, for CPU seconds are a process's."""
 
     def processes(self) -> int:
         """--workers, checked."""
@@ -199,6 +204,8 @@ class BenchPaper(_Parallel):
             raise InputError("--preset paper needs --data, a NeRF-synthetic folder; --preset cpu makes its scenes")
         preset = PRESETS[self.preset]
         todo = cells(self.tables, self.scenes, self.strategies, self.seeds)
+        if not todo:
+            raise InputError("--tables and --strategies: no chosen table has a chosen strategy; see --dry-run")
         if self.data is not None:
             check_real(self.data, todo)
         path = self.output_dir / "result.json"

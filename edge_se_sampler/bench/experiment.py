@@ -95,7 +95,9 @@ def begun(path: Path, settings: Any) -> dict[str, Any]:
         return {"version": VERSION, "settings": told, "machine": machine(), "runs": [], "errors": []}
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-        version, found, _ = result["version"], result["settings"], result["runs"]
+        version, found = result["version"], result["settings"]
+        if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
+            raise TypeError("runs and errors are lists of objects")
     except (OSError, ValueError, KeyError, TypeError) as problem:
         raise InputError(f"{path}: not a result of this command ({problem!r})") from problem
     if version != VERSION or found != told:
@@ -107,7 +109,7 @@ def missing(cells: Sequence[Any], result: dict[str, Any]) -> list[Any]:
     """The cells that a result has neither trained nor told the failure of."""
     runs = [*result["runs"], *result["errors"]]
     keys = list(asdict(cells[0])) if cells else []
-    done = {tuple(run[key] for key in keys) for run in runs}
+    done = {tuple(run.get(key) for key in keys) for run in runs}
     return [cell for cell in dict.fromkeys(cells) if tuple(asdict(cell).values()) not in done]
 
 
@@ -143,11 +145,13 @@ def run_cells(
                     _take(result, place[future], future, keep)
                     write_result(path, result)
                     progress.update(len(cells) - len(missing(cells, result)))
-            except BrokenExecutor:
-                executor.shutdown(cancel_futures=True)
-                continue
-            except BaseException:
-                executor.shutdown(wait=False, cancel_futures=True)
+            except BaseException as problem:
+                for future in place:
+                    future.cancel()
+                if isinstance(problem, BrokenExecutor):
+                    continue
+                for child in multiprocessing.active_children():  # what they do is lost in any case
+                    child.terminate()
                 raise
         break
     for cell in missing(cells, result):

@@ -99,8 +99,12 @@ def _begun(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
             "machine": machine(),
             "runs": [],
         }
-    result = json.loads(path.read_text())
-    if result.get("settings") != settings:
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+        found, _ = result["settings"], result["runs"]
+    except (OSError, ValueError, KeyError, TypeError) as problem:
+        raise InputError(f"{path}: not a result of this command ({problem!r})") from problem
+    if found != settings:
         raise InputError(f"{path}: is of other settings; name another --output-dir, or move it away")
     return result
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from edge_se_sampler.engine.evaluation import Picture, measures
+from edge_se_sampler.errors import InputError
 
 Outcome = Literal["learnt", "slow", "background"]
 
@@ -26,12 +27,18 @@ def foreground_share(results: dict[str, Any], background: list[dict[str, float |
     Args:
         results: of `evaluate`.
         background: of `background_measures` on the same views.
+
+    Raises:
+        InputError: no view tells the object from the background.
     """
     pairs = [
         (own["foreground_psnr"], alone["foreground_psnr"])
         for own, alone in zip(results["images"], background, strict=True)
     ]
-    return float(np.mean([10 ** ((alone - own) / 10) for own, alone in pairs if own is not None and alone is not None]))
+    shares = [10 ** ((alone - own) / 10) for own, alone in pairs if own is not None and alone is not None]
+    if not shares:
+        raise InputError("the held-out views show no object by alpha, which the rule of failure asks for")
+    return float(np.mean(shares))
 
 
 def judged(results: dict[str, Any], pictures: list[Picture], shade: float) -> dict[str, Any]:

@@ -34,6 +34,8 @@ _SETTINGS: dict[str, field.Check[float]] = {
     "fl_y": field.positive,
 }
 
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
 
 @dataclass(frozen=True)
 class Views:
@@ -172,6 +174,10 @@ def _frame(entry: Any, where: Where, shared: dict[str, _Setting]) -> _Frame:
 
 
 def _settings(parent: field.Object, where: Where) -> dict[str, _Setting]:
+    for key in _DISTORTION:
+        if key in parent and field.number(parent[key], where.key(key)) != 0:
+            problem = f"is {shown(parent[key])}, but rays here know no lens distortion"
+            raise where.key(key).error(problem, "undistort the images, and leave it out")
     return {
         key: _Setting(check(parent[key], where.key(key)), where.key(key))
         for key, check in _SETTINGS.items()

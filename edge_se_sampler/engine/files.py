@@ -20,7 +20,7 @@ def write_atomically(path: Path, content: bytes) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.parent / f".{path.name}.tmp"
     try:
         with open(temporary, "wb") as file:
             file.write(content)
@@ -38,6 +38,20 @@ def write_atomically(path: Path, content: bytes) -> None:
             temporary.unlink(missing_ok=True)
         reason = problem.strerror or str(problem)
         raise InputError(f"{path}: cannot be written ({reason}); what was there before is untouched") from problem
+
+
+def check_output(path: Path, flag: str = "--output-path") -> None:
+    """A file that a result will be written to, refused before the work that it takes to have one.
+
+    Raises:
+        InputError: it names no file, is a folder, or its folder is not there or not to be written to.
+    """
+    if not path.name or path.is_dir():
+        raise InputError(f"{flag} {path}: must name a file, not a folder")
+    if not path.parent.is_dir():
+        raise InputError(f"{flag} {path}: no such folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"{flag} {path}: {path.parent} cannot be written")
 
 
 def make_folder(path: Path, flag: str) -> None:

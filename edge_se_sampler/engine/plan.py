@@ -34,6 +34,7 @@ def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
     preview = config.steps_per_eval_image
     plan = replace(
         config,
+        data=config.data.resolve() if config.data else None,
         experiment_name=config.experiment_name or (config.data.resolve().name if config.data else "unnamed"),
         max_num_iterations=iterations,
         steps_per_eval_image=max(1, iterations // 10) if preview is None else preview,
@@ -83,8 +84,7 @@ def _check(plan: TrainerConfig) -> None:
     check_fineness(model, "pipeline.model.")
     if isinstance(model, InfoNeRFModelConfig):
         _check_info(model)
-    if plan.max_seconds is not None and not plan.max_seconds > 0:
-        raise InputError(f"--max-seconds is {plan.max_seconds}: must be above 0")
+    check_max_seconds(plan.max_seconds)
     if not 0 < (plan.optimizer.lr or 0) < float("inf"):
         raise InputError(f"--optimizer.lr is {plan.optimizer.lr}: must be above 0")
     if not 0 < plan.optimizer.final_fraction <= 1:
@@ -94,6 +94,12 @@ def _check(plan: TrainerConfig) -> None:
     for name in (plan.method_name, plan.experiment_name):
         if name in (None, "", ".", "..") or "/" in str(name) or "\0" in str(name):
             raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
+
+
+def check_max_seconds(seconds: float | None) -> None:
+    """Raises InputError for a time that is none; None: no limit."""
+    if seconds is not None and not 0 < seconds < float("inf"):
+        raise InputError(f"--max-seconds is {seconds}: must be above 0; leave it out for no limit")
 
 
 def _check_nerf(model: NeRFModelConfig) -> None:

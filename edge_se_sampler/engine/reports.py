@@ -16,7 +16,7 @@ from edge_se_sampler.engine.evaluation import (
     shade_behind,
     target_image,
 )
-from edge_se_sampler.engine.files import make_folder, write_image, write_json
+from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_views, test_pictures
@@ -30,8 +30,7 @@ def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) 
     Raises:
         InputError: a bad run, or an output that cannot be written.
     """
-    if not output_path.parent.is_dir():
-        raise InputError(f"--output-path {output_path}: no such folder {output_path.parent}")
+    check_output(output_path)
     config, model, checkpoint = load_model(RunFolder(run))
     pictures = test_pictures(config)
     if render_output_path is not None:

@@ -34,7 +34,7 @@ class RunFolder:
             InputError: the output folder cannot be written.
         """
         parent = config.output_dir / str(config.experiment_name) / config.method_name
-        stamp = time.strftime("%Y-%m-%d_%H%M%S")
+        stamp, content = time.strftime("%Y-%m-%d_%H%M%S"), config_to_json(config)
         try:
             parent.mkdir(parents=True, exist_ok=True)
             path = _new_folder(parent, stamp)
@@ -44,7 +44,7 @@ class RunFolder:
             reason = problem.strerror or str(problem)
             raise InputError(f"--output-dir {config.output_dir}: cannot be written ({reason})") from problem
         run = cls(path)
-        write_json(run.path / "config.json", config_to_json(config))
+        write_json(run.path / "config.json", content)
         return run
 
     @property
@@ -87,12 +87,21 @@ class RunFolder:
             raise InputError(f"{path}: cannot be written ({problem.strerror})") from problem
 
     def metrics(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; a last line cut short by a kill is left out."""
+        """The lines of metrics.jsonl; a last line cut short by a kill is left out.
+
+        Raises:
+            InputError: it is damaged.
+        """
         path = self.path / "metrics.jsonl"
         if not path.exists():
             return []
-        lines = path.read_text(encoding="utf-8").split("\n")
-        return [json.loads(line) for line in lines[:-1]]
+        try:
+            lines = [json.loads(line) for line in path.read_text(encoding="utf-8").split("\n")[:-1]]
+            if not all(isinstance(line["step"], int) for line in lines):
+                raise TypeError("a step is no number")
+        except (OSError, ValueError, KeyError, TypeError) as problem:
+            raise InputError(f"{path}: damaged ({problem!r}); mend or remove it") from problem
+        return lines
 
     def forget_after(self, step: int) -> None:
         """Drop metrics of later steps: a resumed run writes them again."""
@@ -134,7 +143,7 @@ def config_from_json(default: Any, values: Any, where: str) -> Any:
     """Plain values back into the (nested) config dataclass that they came from.
 
     Raises:
-        InputError: fields that are missing or unknown: another version wrote it.
+        InputError: fields that are missing, unknown or of another type: another version wrote it.
     """
     fields = {field.name: field for field in dataclasses.fields(default)}
     if not isinstance(values, dict) or set(values) != set(fields):
@@ -147,5 +156,7 @@ def config_from_json(default: Any, values: Any, where: str) -> Any:
             new = config_from_json(old, new, f"{where}: {name}")
         elif "Path" in str(field.type) and isinstance(new, str):
             new = Path(new)
+        elif (type(old), type(new)) != (float, int) and None not in (old, new) and type(old) is not type(new):
+            raise InputError(f"{where}: {name} is {new!r}, where {old!r} would be of its type; was it edited by hand?")
         chosen[name] = new
     return dataclasses.replace(default, **chosen)

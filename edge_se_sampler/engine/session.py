@@ -15,7 +15,7 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
-from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.plan import check_max_seconds, planned
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
 from edge_se_sampler.errors import InputError
@@ -44,8 +44,9 @@ def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
     Raises:
         InputError: no such run, no or bad checkpoint, or its data is gone.
     """
+    check_max_seconds(max_seconds)
     config = dataclasses.replace(run.config(), max_seconds=max_seconds)
-    latest_checkpoint(run.checkpoints)
+    load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))  # before anything is built on it
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     keep_freed_memory()
@@ -74,7 +75,8 @@ def test_pictures(config: TrainerConfig) -> list[Picture]:
     Raises:
         InputError: neither is there, or one of them is bad.
     """
-    assert config.data is not None
+    if config.data is None or not config.data.is_dir():
+        raise InputError(f"{config.data}: no such folder, where this run's held-out views were")
     for split in ("test", "val"):
         if has_split(config.data, split):
             pictures = pictures_of(read_blender(config.data, split))

@@ -81,7 +81,7 @@ class InfoNeRFModelConfig(NeRFModelConfig):
     _target: ClassVar[type | str] = "edge_se_sampler.nerf.info:InfoNeRFModel"
 
     num_unseen_rays: int | None = None
-    """Unseen rays of a step; left out, as many as it trains on (its code: 1024 and 1024)."""
+    """Unseen rays of a step; left out, as many as it trains on (its code: 1024 and 1024); at 0 there is no entropy."""
     entropy_weight: float = 0.001
     """Of the rays' entropy, in bits."""
     entropy_threshold: float = 0.1

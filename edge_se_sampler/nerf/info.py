@@ -100,11 +100,11 @@ class InfoNeRFModel(NeRFModel):
         return self.config.entropy_weight * entropy + self._gain(rays, outputs)
 
     def _gain(self, rays: RayBundle, outputs: dict[str, Tensor]) -> Tensor:
-        """Weighted so that seen and unseen rays, each a mean of its own, make one mean over all."""
+        """Seen and unseen rays, each a mean of its own, count half each; alone, the former count all."""
         if not self.gain_weight:
             return torch.zeros((), device=self.device)
         near = self(turned(rays, self.rotation))
-        return self.gain_weight / 2 * information_gain(_alpha(outputs), _alpha(near))
+        return self.gain_weight / (2 if self.num_unseen_rays else 1) * information_gain(_alpha(outputs), _alpha(near))
 
 
 def _alpha(outputs: dict[str, Tensor]) -> Tensor:

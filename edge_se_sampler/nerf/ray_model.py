@@ -71,7 +71,8 @@ class RayModel(nn.Module, ABC):
         """As torch's; a state with cells settles the model in them.
 
         Raises:
-            InputError: the model is settled in other cells: features would lie at other corners.
+            InputError: it is another model's, or the model is settled in other cells: features would lie at other
+                corners.
         """
         if "grid.possible" in state_dict:
             told = {key: state_dict[f"grid.{key}"] for key in ("corner", "side", "possible")}
@@ -82,7 +83,10 @@ class RayModel(nn.Module, ABC):
                     "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
                     "this machine rounds otherwise; resume with what it began with, or train anew"
                 )
-        return super().load_state_dict(state_dict, *args, **kwargs)
+        try:
+            return super().load_state_dict(state_dict, *args, **kwargs)
+        except RuntimeError as problem:
+            raise InputError("the checkpoint's weights are not this model's: another version wrote them") from problem
 
     def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
         """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.

@@ -11,7 +11,6 @@ from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
 from edge_se_sampler.bench.trial import trial
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf.config import InfoNeRFModelConfig
 
 Method = Literal["nerf", "info-nerf"]
 Placement = Literal["centered", "padded", "shifted"]
@@ -143,12 +142,13 @@ def iterations_of(cell: Cell, preset: Preset) -> int:
 def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> TrainerConfig:
     """What a cell trains: dense and faithful, nothing culled."""
     table = TABLES[cell.table]
-    config = registered_methods()[cell.strategy].specification.config
-    manager = config.pipeline.datamanager
+    info = table.method == "info-nerf"
+    methods = registered_methods()
+    config = methods["info-nerf" if info else cell.strategy].specification.config
+    manager = methods[cell.strategy].specification.config.pipeline.datamanager
     sampler = replace(manager.pixel_sampler, **table.sampler)
     manager = replace(manager, train_num_rays_per_batch=preset.rays, pixel_sampler=sampler)
-    info = table.method == "info-nerf"
-    model = InfoNeRFModelConfig() if info else config.pipeline.model
+    model = config.pipeline.model
     if preset.samples is not None:
         coarse, importance = preset.samples
         model = replace(model, num_coarse_samples=coarse, num_importance_samples=importance)
