@@ -340,7 +340,7 @@ def _one_line(complaint: str, arguments: list[str], program: str, names: list[st
         return f"{program} has no {arguments[0]!r}; {hint}" if arguments else f"{program} what? {hint}"
     lines = [line.strip("│╭╮╰╯ ") for line in complaint.splitlines()]
     body = " ".join(line for line in lines[1:] if line)
-    body, *suggestions = re.split(r" ?─{4,} ?", body)
+    body, *suggestions = [part for part in re.split(r" ?[─-]{4,} ?", body) if part]  # dashes where boxes cannot be
     nearest = re.search(r"(--[\w.-]+)", " ".join(suggestions[:1])) if "Perhaps" in "".join(suggestions[:1]) else None
     hint = f"; did you mean {nearest.group(1)}?" if nearest else ""
     return f"{body}{hint} (see {program} {arguments[0]} --help)"

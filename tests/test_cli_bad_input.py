@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -123,6 +126,14 @@ def test_unknown_names_suggest_the_nearest(tmp_path: Path, edge_se):
     assert "--data" in refused(edge_se, tmp_path, "train", "edge-nerf")
     assert "--out" in refused(edge_se, tmp_path, "scenes")
     assert "mic" in refused(edge_se, tmp_path, "scenes", "--out", tmp_path / "s", "--names", "mike")
+
+
+def test_where_boxes_cannot_be_printed_it_is_one_line_too(scene: Path):
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-m", "edge_se_sampler.cli", "show", "--data", scene, "--sed", "3"]
+    answer = subprocess.run(command, env=plain, capture_output=True, text=True)
+    assert answer.returncode == 2
+    assert answer.stderr == "edge-se: Unrecognized options: --sed, 3; did you mean --seed? (see edge-se show --help)\n"
 
 
 def test_an_output_folder_that_cannot_be_written(scene: Path, tmp_path: Path, edge_se):
