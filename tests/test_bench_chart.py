@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench import experiment
 from edge_se_sampler.bench.chart import train as train_module
 from edge_se_sampler.bench.chart.draw import draw_chart, draw_scenes
 from edge_se_sampler.bench.chart.external import read_external
@@ -234,45 +228,6 @@ def test_curves_of_a_single_look_are_drawn() -> None:
     np.testing.assert_array_equal(drawn[0].get_xydata(), [[3, 21.5]])
     labels = [text.get_text() for text in draw_scenes(runs, [], Scale(seconds=2)).legends[0].get_texts()]
     assert sorted(labels) == ["Edge", "lean-nerf"]  # once each, whatever the seeds
-
-
-# -- processes
-
-
-def test_a_killed_training_is_told_and_costs_no_other(tmp_path: Path) -> None:
-    todo = cells(("lean", "edge", "se"), ("mic", "mic"), (0, 0))
-    result = experiment.begun(tmp_path / "result.json", Scale())
-
-    def train(cell: Cell) -> dict[str, Any]:
-        if cell.variant == "edge":
-            return experiment.alone(os._exit, 1)
-        return {"variant": cell.variant, "scene": cell.scene, "seed": cell.seed}
-
-    experiment.run_cells(todo, result, tmp_path / "result.json", lambda: ThreadPoolExecutor(2), train, lambda _: ())
-    assert [run["variant"] for run in result["runs"]] == ["lean", "se"]  # once each
-    ((error),) = result["errors"]
-    assert (error["variant"], error["error"]) == (
-        "edge", "RuntimeError: its process was killed; is there too little memory?",
-    )  # fmt: skip
-
-
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for processes in /proc")
-def test_a_process_of_its_own_ends_with_the_one_that_asked_for_it() -> None:
-    program = "import time; from edge_se_sampler.bench.experiment import alone; alone(time.sleep, 60)"
-    with subprocess.Popen([sys.executable, "-c", program]) as parent:
-        children: list[Path] = []
-        until = time.monotonic() + 60
-        while not children and time.monotonic() < until:
-            time.sleep(0.2)
-            numbers = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
-            running = [Path("/proc") / number for number in numbers]
-            children = [place for place in running if b"spawn_main" in (place / "cmdline").read_bytes()]
-        time.sleep(3)  # it imports, and begins to sleep
-        parent.kill()
-    assert children
-    while children[0].exists() and b"spawn_main" in (children[0] / "cmdline").read_bytes():
-        assert time.monotonic() < until + 20, "it goes on"
-        time.sleep(0.2)
 
 
 # -- the command

@@ -5,10 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -203,86 +199,6 @@ def test_a_killed_worker_costs_no_finished_cell(experiment: Any) -> None:
     result = experiment(TWO_CELLS, dies_once, running.executor_of(1, None))
     assert len(result["runs"]) == 2
     assert result["errors"] == []
-
-
-def interrupts_itself() -> int:
-    os.kill(os.getpid(), signal.SIGINT)
-    return 7
-
-
-def test_ctrl_c_is_for_the_one_that_gives_out_the_work() -> None:
-    """It reaches every process of the terminal; a worker that answered it would print a traceback."""
-    with running.executor_of(1, None)() as executor:
-        assert executor.submit(interrupts_itself).result() == 7
-
-
-INTERRUPTED = """
-import os, pathlib, signal, sys, time
-from edge_se_sampler.bench.chart.train import Scale
-from edge_se_sampler.bench.chart.variant import Cell
-from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
-
-def interrupts_and_works_on(cell, *_):
-    os.kill(os.getppid(), signal.SIGINT)
-    time.sleep(60)
-
-if __name__ == "__main__":
-    path = pathlib.Path("result.json")
-    todo = [Cell("lean", "mic", seed) for seed in range(3)]
-    run_cells(todo, begun(path, Scale()), path, executor_of(1, None), interrupts_and_works_on, lambda _: ())
-"""
-
-
-def test_ctrl_c_waits_for_no_cell(tmp_path: Path) -> None:
-    (tmp_path / "interrupted.py").write_text(INTERRUPTED)
-    began = time.monotonic()
-    answer = subprocess.run([sys.executable, "interrupted.py"], cwd=tmp_path, capture_output=True, text=True)
-    assert "KeyboardInterrupt" in answer.stderr
-    assert time.monotonic() - began < 45
-
-
-class OnlyWaits(ThreadPoolExecutor):
-    """As dask's executor: it can cancel futures, not all at once."""
-
-    def shutdown(self, wait: bool = True) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        super().shutdown(wait=wait)
-
-
-def test_an_executor_that_only_waits_is_left_in_good_order(experiment: Any) -> None:
-    def interrupted(*_: Any) -> dict[str, Any]:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        experiment(TWO_CELLS, interrupted, lambda: OnlyWaits(1))
-
-
-GIVES_OUT_WORK = """
-import os, time
-from edge_se_sampler.bench.experiment import executor_of
-if __name__ == "__main__":
-    executor = executor_of(1, None)()
-    print(executor.submit(os.getpid).result(), flush=True)
-    time.sleep(60)
-"""
-
-
-def test_workers_do_not_outlive_the_one_that_gave_out_the_work(tmp_path: Path) -> None:
-    (tmp_path / "gives_out_work.py").write_text(GIVES_OUT_WORK)
-    command = [sys.executable, tmp_path / "gives_out_work.py"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        worker = int(process.stdout.readline())
-        os.kill(worker, 0)
-        process.kill()
-    for _ in range(100):
-        try:
-            os.kill(worker, 0)
-        except ProcessLookupError:
-            return
-        if Path(f"/proc/{worker}/stat").exists() and ") Z " in Path(f"/proc/{worker}/stat").read_text():
-            return  # dead, and its new parent has not looked yet
-        time.sleep(0.1)
-    raise AssertionError(f"worker {worker} is still there")
 
 
 @pytest.mark.parametrize(

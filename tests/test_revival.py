@@ -13,11 +13,12 @@ from tiny import tiny_config, tiny_rays, tiny_views
 
 from edge_se_sampler import schedule
 from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import planned
 from edge_se_sampler.engine.revival import PATIENCE, dead_networks
-from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import STRATEGIES, registered_methods
 from edge_se_sampler.nerf.model import NeRFModel
@@ -148,7 +149,7 @@ def test_a_checkpoint_remembers_silence_and_sub_seeds(saved_after: int, tmp_path
     went_on = [trainer.train_iteration(step) for step in range(saved_after, saved_after + 12)]
 
     resumed = trainer.config.setup(run=trainer.run, pipeline=Pipeline.build(trainer.config, VIEWS, "cpu"), preview=None)
-    resumed.resume()
+    resumed.resume(load_checkpoint(latest_checkpoint(resumed.run.checkpoints), config_digest(resumed.config)))
     assert resumed.next_step == saved_after
     assert [resumed.train_iteration(step) for step in range(saved_after, saved_after + 12)] == went_on
     assert resumed.revival.used == trainer.revival.used >= 2  # pyright: ignore[reportOptionalMemberAccess]
@@ -184,6 +185,6 @@ def test_a_checkpoint_remembers_what_auto_has_seen(
     assert len({strategy for _, strategy in went_on}) == 2
 
     resumed = trainer.config.setup(run=trainer.run, pipeline=Pipeline.build(trainer.config, VIEWS, "cpu"), preview=None)
-    resumed.resume()
+    resumed.resume(load_checkpoint(latest_checkpoint(resumed.run.checkpoints), config_digest(resumed.config)))
     again: Any = resumed.pipeline.datamanager.train_pixel_sampler
     assert [(resumed.train_iteration(step), again.strategy) for step in range(saved_after, saved_after + 30)] == went_on

@@ -30,11 +30,10 @@ class BenchSamplers:
 
     def run(self) -> None:
         from edge_se_sampler.bench.samplers import bench_samplers, table_of
-        from edge_se_sampler.engine.files import check_output, make_folder, write_json
+        from edge_se_sampler.engine.files import make_room, write_json
 
         if self.output_path is not None:
-            make_folder(self.output_path.parent, "--output-path, folder")
-            check_output(self.output_path)
+            make_room(self.output_path)
         if min(self.images, self.size, self.draws, self.repeats) < 1:
             raise InputError("--images, --size, --draws and --repeats must be at least 1")
         result = bench_samplers(self.images, self.size, self.draws, self.repeats)
@@ -66,14 +65,13 @@ class BenchScoring:
     def run(self) -> None:
         from edge_se_sampler.bench.scoring import bench_scoring, scene_in, table_of
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
-        from edge_se_sampler.engine.files import check_output, make_folder, write_json
+        from edge_se_sampler.engine.files import make_room, write_json
 
         check_known("scene", (self.scene,), ANALOG_OF)
         if min(self.rays, self.rounds, self.learning) < 1:
             raise InputError("--rays, --rounds and --learning must be at least 1")
         if self.output_path is not None:
-            make_folder(self.output_path.parent, "--output-path, folder")
-            check_output(self.output_path)
+            make_room(self.output_path)
         data = scene_in(self.workplace, self.scene)
         result = bench_scoring(data, self.size, self.rays, self.rounds, self.learning)
         print(table_of(result))

@@ -11,9 +11,9 @@ from edge_se_sampler.bench.scoring import scene_in
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.files import make_folder, write_json
+from edge_se_sampler.engine.plan import check_seconds
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
-from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.show import require_pyplot, save_figure
 
@@ -32,8 +32,7 @@ def bench_quality(
         InputError: a folder that cannot be written, an unknown scene, or matplotlib missing.
     """
     require_pyplot()
-    if not 0 < seconds < float("inf"):
-        raise InputError(f"--seconds is {seconds}: must be above 0")
+    check_seconds(seconds, "--seconds")
     make_folder(output_dir, "--output-dir")
     data = scene_in(workplace, scene)
     config = registered_methods()[method].specification.config

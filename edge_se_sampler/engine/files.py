@@ -54,6 +54,16 @@ def check_output(path: Path, flag: str = "--output-path") -> None:
         raise InputError(f"{flag} {path}: {path.parent} cannot be written")
 
 
+def make_room(path: Path, flag: str = "--output-path") -> None:
+    """Make the folder of a file that a result will be written to, and check that it can be.
+
+    Raises:
+        InputError: as `make_folder` and `check_output`.
+    """
+    make_folder(path.parent, f"{flag}, folder")
+    check_output(path, flag)
+
+
 def make_folder(path: Path, flag: str) -> None:
     """A folder that results will be written to, made before the work that it takes to have some.
 

@@ -84,7 +84,7 @@ def _check(plan: TrainerConfig) -> None:
     check_fineness(model, "pipeline.model.")
     if isinstance(model, InfoNeRFModelConfig):
         _check_info(model)
-    check_max_seconds(plan.max_seconds)
+    check_seconds(plan.max_seconds)
     if not 0 < (plan.optimizer.lr or 0) < float("inf"):
         raise InputError(f"--optimizer.lr is {plan.optimizer.lr}: must be above 0")
     if not 0 < plan.optimizer.final_fraction <= 1:
@@ -96,10 +96,10 @@ def _check(plan: TrainerConfig) -> None:
             raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
 
 
-def check_max_seconds(seconds: float | None) -> None:
+def check_seconds(seconds: float | None, flag: str = "--max-seconds") -> None:
     """Raises InputError for a time that is none; None: no limit."""
     if seconds is not None and not 0 < seconds < float("inf"):
-        raise InputError(f"--max-seconds is {seconds}: must be above 0; leave it out for no limit")
+        raise InputError(f"{flag} is {seconds}: must be above 0, and finite")
 
 
 def _check_nerf(model: NeRFModelConfig) -> None:

@@ -15,7 +15,7 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
-from edge_se_sampler.engine.plan import check_max_seconds, planned
+from edge_se_sampler.engine.plan import check_seconds, planned
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
 from edge_se_sampler.errors import InputError
@@ -44,14 +44,14 @@ def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
     Raises:
         InputError: no such run, no or bad checkpoint, or its data is gone.
     """
-    check_max_seconds(max_seconds)
+    check_seconds(max_seconds)
     config = dataclasses.replace(run.config(), max_seconds=max_seconds)
-    load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))  # before anything is built on it
+    state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))  # before anything is built on it
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     keep_freed_memory()
     trainer = config.setup(run=run, pipeline=Pipeline.build(config, views, device), preview=preview)
-    trainer.resume()
+    trainer.resume(state)
     return trainer
 
 

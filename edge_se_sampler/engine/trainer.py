@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
@@ -56,13 +56,12 @@ class Trainer:
             self.revival = Revival(pipeline.model, self.optimizer, probe, seed)
         self._preview_psnr: float | None = None
 
-    def resume(self) -> None:
-        """Take up the run at its last checkpoint.
+    def resume(self, state: dict[str, Any]) -> None:
+        """Take up the run at a checkpoint's state.
 
         Raises:
-            InputError: no checkpoint, or a bad one.
+            InputError: it is another model's, or of a scene that has changed since.
         """
-        state = load_checkpoint(latest_checkpoint(self.run.checkpoints), config_digest(self.config))
         self.pipeline.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         for part, watched in self._watched():

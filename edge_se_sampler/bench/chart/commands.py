@@ -107,12 +107,11 @@ class BenchBeside:
         from edge_se_sampler.bench.chart.train import Scale
         from edge_se_sampler.bench.scoring import scene_in
         from edge_se_sampler.data.made.catalogue import ANALOG_OF
-        from edge_se_sampler.engine.files import check_output, make_folder
+        from edge_se_sampler.engine.files import make_room
 
         check_known("scenes", self.scenes, ANALOG_OF)
         _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
-        make_folder(self.output_path.parent, "--output-path, folder")
-        check_output(self.output_path)
+        make_room(self.output_path)
         scenes = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
         result = run_beside(
             self.program,
@@ -146,12 +145,11 @@ class BenchStep:
     def run(self) -> None:
         from edge_se_sampler.bench.chart.step import bench_step
         from edge_se_sampler.bench.scoring import scene_in
-        from edge_se_sampler.engine.files import check_output, make_folder, write_json
+        from edge_se_sampler.engine.files import make_room, write_json
 
         if self.rounds < 1:
             raise InputError(f"--rounds is {self.rounds}: must be at least 1")
-        make_folder(self.output_path.parent, "--output-path, folder")
-        check_output(self.output_path)
+        make_room(self.output_path)
         result = bench_step(self.checkout, scene_in(self.workplace, "bricks"), self.rounds)
         write_json(self.output_path, result)
         seconds = result["medians"]
