@@ -30,7 +30,8 @@ from edge_se_sampler.nerf.hull import (
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 
 MOST_CELLS = 2**18
-"""More would cost more than they tell."""
+"""More cost more than they tell: with four times as many, bricks at 400 pixels ends after 100 CPU seconds at 33.14 dB,
+not 34.41."""
 MOST_PLACES = 2**24
 """Cells of the box around them, which grids have a number for, occupied or not."""
 TOLERATED = 0.01
