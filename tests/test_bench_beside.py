@@ -104,15 +104,13 @@ def test_a_program_is_run_with_each_seed_and_its_curves_are_kept(
     made: Path, tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     theirs, path = checkout(tmp_path / "theirs", "run_nerf.py", NERF_PYTORCH), tmp_path / "r" / "theirs.json"
-    (tmp_path / "w" / "scenes").mkdir(parents=True)
-    (tmp_path / "w" / "scenes" / "mic").symlink_to(made)
-    flags = ["--program", "nerf-pytorch", "--checkout", theirs, "--output-path", path, "--workplace", tmp_path / "w",
+    flags = ["--program", "nerf-pytorch", "--checkout", theirs, "--output-path", path, "--data", made.parent,
              "--scenes", "mic", "--seconds", 1, "--threads", 2, "--label", "small"]  # fmt: skip
     answer = edge_se("bench", "beside", *flags, "--flags=--netdepth 4", "--seeds", 0)
     assert answer.code == 0, answer
     answer = edge_se("bench", "beside", *flags, "--flags=--netdepth 4", "--seeds", 0, 1)
     assert answer.code == 0, answer
-    result = read_external(path, "--output-path", 2)
+    result = read_external(path, "--output-path", Scale(1, threads=2, pixels=24))
     commit = subprocess.run(["git", "-C", theirs, "rev-parse", "HEAD"], capture_output=True, text=True).stdout
     assert (result["name"], result["command"]) == ("nerf-pytorch, small", "nerf-pytorch --netdepth 4")
     assert commit.startswith(result["version"])
@@ -137,15 +135,13 @@ def test_a_program_that_refuses_its_flags_or_ends_too_soon_is_told_in_one_line(
     made: Path, tmp_path: Path, edge_se: Any
 ) -> None:
     theirs = checkout(tmp_path / "theirs", "run_nerf.py", NERF_PYTORCH)
-    (tmp_path / "w" / "scenes").mkdir(parents=True)
-    (tmp_path / "w" / "scenes" / "mic").symlink_to(made)
     flags = [
         "--program",
         "nerf-pytorch",
         "--output-path",
         tmp_path / "t.json",
-        "--workplace",
-        tmp_path / "w",
+        "--data",
+        made.parent,
         "--scenes",
         "mic",
     ]

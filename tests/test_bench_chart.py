@@ -185,7 +185,7 @@ GOOD = {
 def test_other_programs_come_in_as_a_file(tmp_path: Path) -> None:
     path = tmp_path / "theirs.json"
     path.write_text(json.dumps(GOOD))
-    assert read_external(path, "--external", 1) == GOOD
+    assert read_external(path, "--external", Scale()) == GOOD
 
 
 @pytest.mark.parametrize(
@@ -201,15 +201,17 @@ def test_a_bad_file_is_refused_in_one_line(bad: Any, tmp_path: Path) -> None:
     path = tmp_path / "theirs.json"
     path.write_text(bad if isinstance(bad, str) else json.dumps(bad))
     with pytest.raises(InputError, match=r"^--external .*theirs.json: not a result"):
-        read_external(path, "--external", 1)
+        read_external(path, "--external", Scale())
 
 
-def test_seconds_of_another_kind_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("other", [{"threads": 2}, {"pixels": 400}])
+def test_seconds_of_another_kind_are_refused(other: dict[str, int], tmp_path: Path) -> None:
     path = tmp_path / "theirs.json"
-    path.write_text(json.dumps({**GOOD, "threads": 2}))
-    assert read_external(path, "--external", 2)["threads"] == 2
-    with pytest.raises(InputError, match=r"theirs.json: timed with 2 threads, not 1"):
-        read_external(path, "--external", 1)
+    path.write_text(json.dumps(GOOD | other))
+    assert read_external(path, "--external", Scale(**other)) == GOOD | other
+    ((kind, value),) = other.items()
+    with pytest.raises(InputError, match=rf"theirs.json: made with {value} {kind}, not 1"):
+        read_external(path, "--external", Scale())
 
 
 def test_a_program_stands_beside_us_only_on_our_scenes() -> None:
@@ -236,9 +238,7 @@ def test_curves_of_a_single_look_are_drawn() -> None:
 def test_the_command_leaves_table_and_pictures_and_goes_on(made: Path, tmp_path: Path, edge_se: Any) -> None:
     theirs, out = tmp_path / "theirs.json", tmp_path / "out"
     theirs.write_text(json.dumps(GOOD))
-    (tmp_path / "w" / "scenes").mkdir(parents=True)
-    (tmp_path / "w" / "scenes" / "mic").symlink_to(made)
-    flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--scenes", "mic", "--seeds", 0, "--seconds", 2]
+    flags = ["--output-dir", out, "--data", made.parent, "--scenes", "mic", "--seeds", 0, "--seconds", 2]
     answer = edge_se("bench", "chart", *flags, "--variants", "lean", "random", "--external", theirs)
     assert answer.code == 0, answer
     assert {path.name for path in out.iterdir()} == {
@@ -248,13 +248,18 @@ def test_the_command_leaves_table_and_pictures_and_goes_on(made: Path, tmp_path:
     assert [run["variant"] for run in result["runs"]] == ["lean", "random"]
     assert result["errors"] == []
     assert result["external"] == [GOOD]
+    assert result["settings"] == {"seconds": 2, "threads": 1, "pixels": 24}
     answer = edge_se("bench", "chart", *flags, "--variants", "lean", "--dry-run")
     assert answer.out.splitlines()[-1] == "1 trainings of 2 s, 0 still to do"
 
 
-def test_bad_flags_are_refused(tmp_path: Path, edge_se: Any) -> None:
+def test_bad_flags_are_refused(made: Path, tmp_path: Path, edge_se: Any) -> None:
+    (larger,) = make_scenes(tmp_path / "data", ["drums"], size=25, num_train=1, num_val=1, num_test=1)
+    (tmp_path / "data" / "mic").symlink_to(made)
     for flags, word in (
         (["--variants", "best"], "'best' is none of lean"),
+        (["--data", larger.parent, "--scenes", "mic", "drums"], "different sizes (mic 24, drums 25 pixels)"),
+        (["--data", larger.parent, "--scenes", "chair"], "chair"),
         (["--scenes", "lego"], "'lego' is none of"),
         (["--seconds", "0"], "--seconds is 0"),
         (["--external", tmp_path / "none.json"], "none.json"),

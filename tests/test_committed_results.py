@@ -223,7 +223,7 @@ def test_lean_nerf_is_on_the_committed_charts_front():
 @pytest.mark.parametrize(("seconds", "bar"), [(3, 26), (7, 28), (20, 31), (100, 34)])
 def test_lean_nerf_is_as_fast_on_one_core_as_it_should_be_on_two(seconds: float, bar: float):
     told = result("chart/result.json")
-    assert told["settings"] == {"seconds": 60, "threads": 1}
+    assert told["settings"] == {"seconds": 60, "threads": 1, "pixels": 100}
     runs = [run for run in told["runs"] if (run["variant"], run["scene"]) == ("lean", "bricks")]
     assert (over_scenes(runs, seconds) or 0) >= bar
 

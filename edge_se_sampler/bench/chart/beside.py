@@ -109,7 +109,7 @@ def run_beside(
     told = {"name": name, "version": version_of(checkout), "command": f"{program} {flags}".strip(), **asdict(scale)}
     result: dict[str, Any] = {**told, "machine": machine(), "runs": []}
     if path.exists():
-        result = read_external(path, "--output-path", scale.threads)
+        result = read_external(path, "--output-path", scale)
         if any(result.get(key) != value for key, value in told.items()):
             raise InputError(f"{path}: holds runs of something else, or under other flags; name another --output-path")
     done = {(run["scene"], run["seed"]) for run in result["runs"]}

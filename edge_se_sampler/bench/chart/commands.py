@@ -19,11 +19,13 @@ class BenchChart:
     output_dir: Path
     """Where the result goes; trainings that it already has are kept."""
     workplace: Path = Path("bench")
-    """Where scenes are kept."""
+    """Where made scenes are kept."""
+    data: Path | None = None
+    """Folder with a Blender folder a scene, all of one size of image; left out, seven made scenes of 100 x 100."""
     variants: tuple[str, ...] = ()
     """Which; none: all. --dry-run tells what they are."""
     scenes: tuple[str, ...] = ("bricks",)
-    """Of the seven."""
+    """Of the seven, or of --data."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of weights, pixels and jitter."""
     seconds: float = 60
@@ -45,16 +47,14 @@ class BenchChart:
         from edge_se_sampler.bench.chart.train import Scale, run_cell
         from edge_se_sampler.bench.chart.variant import VARIANTS, cells
         from edge_se_sampler.bench.experiment import alone, begun, default_workers, missing, run_cells
-        from edge_se_sampler.bench.scoring import scene_in
-        from edge_se_sampler.data.made.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_folder
         from edge_se_sampler.show import require_pyplot
 
         check_known("variants", self.variants, VARIANTS)
-        check_known("scenes", self.scenes, ANALOG_OF)
         _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
-        others = [read_external(path, "--external", self.threads) for path in self.external]
-        scale, path = Scale(self.seconds, self.threads), self.output_dir / "result.json"
+        scale = Scale(self.seconds, self.threads, _pixels(self.data, self.scenes))
+        others = [read_external(path, "--external", scale) for path in self.external]
+        path = self.output_dir / "result.json"
         todo, result = cells(self.variants, self.scenes, self.seeds), begun(path, scale)
         if self.dry_run:
             for name in self.variants or VARIANTS:
@@ -64,7 +64,7 @@ class BenchChart:
         require_pyplot()
         make_folder(self.output_dir, "--output-dir")
         workers = max(1, default_workers() // self.threads)
-        data = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
+        data = {scene: _folder(self.data, self.workplace, scene) for scene in self.scenes}
         run_cells(
             todo, result, path, lambda: ThreadPoolExecutor(workers),
             lambda cell: alone(run_cell, cell, scale, data[cell.scene]), lambda _: (),
@@ -92,9 +92,11 @@ class BenchBeside:
     label: str = ""
     """What tells these flags from others, in the chart."""
     workplace: Path = Path("bench")
-    """Where scenes are kept."""
+    """Where made scenes are kept."""
+    data: Path | None = None
+    """Folder with a Blender folder a scene, all of one size of image; as bench chart has it."""
     scenes: tuple[str, ...] = ("bricks",)
-    """Of the seven."""
+    """Of the seven, or of --data."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of weights, pixels and jitter."""
     seconds: float = 60
@@ -105,14 +107,12 @@ class BenchBeside:
     def run(self) -> None:
         from edge_se_sampler.bench.chart.beside import run_beside
         from edge_se_sampler.bench.chart.train import Scale
-        from edge_se_sampler.bench.scoring import scene_in
-        from edge_se_sampler.data.made.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_room
 
-        check_known("scenes", self.scenes, ANALOG_OF)
         _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
+        scale = Scale(self.seconds, self.threads, _pixels(self.data, self.scenes))
         make_room(self.output_path)
-        scenes = {scene: scene_in(self.workplace, scene) for scene in self.scenes}
+        scenes = {scene: _folder(self.data, self.workplace, scene) for scene in self.scenes}
         result = run_beside(
             self.program,
             self.checkout,
@@ -120,7 +120,7 @@ class BenchBeside:
             self.flags,
             scenes,
             self.seeds,
-            Scale(self.seconds, self.threads),
+            scale,
             self.output_path,
         )
         for run in result["runs"]:
@@ -163,3 +163,26 @@ def _check_chosen(seeds: tuple[int, ...], scenes: tuple[str, ...], seconds: floa
         raise InputError(f"--seconds is {seconds}: must be at least 1")
     if threads < 1:
         raise InputError(f"--threads is {threads}: must be at least 1")
+
+
+def _pixels(data: Path | None, scenes: tuple[str, ...]) -> int:
+    """Longer side of the scenes' images."""
+    from edge_se_sampler.bench.chart.train import Scale
+    from edge_se_sampler.data.blender import read_blender
+    from edge_se_sampler.data.made.catalogue import ANALOG_OF
+
+    if data is None:
+        check_known("scenes", scenes, ANALOG_OF)
+        return Scale().pixels
+    sides = {scene: max(read_blender(data / scene, "train").images[0].shape[:2]) for scene in scenes}
+    if len(set(sides.values())) > 1:
+        told = ", ".join(f"{scene} {side}" for scene, side in sides.items())
+        raise InputError(f"--data {data}: scenes of different sizes ({told} pixels): chart them apart")
+    return next(iter(sides.values()))
+
+
+def _folder(data: Path | None, workplace: Path, scene: str) -> Path:
+    """A scene's, made if there are no --data."""
+    from edge_se_sampler.bench.scoring import scene_in
+
+    return scene_in(workplace, scene) if data is None else data / scene

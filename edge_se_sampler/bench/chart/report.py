@@ -38,8 +38,9 @@ def report(result: dict[str, Any], pictures: Sequence[Path]) -> str:
     top = ("", "version", "flags", *head[1 : head.index("failed")])
     parts = [
         f"<h1>{TITLE}</h1>",
-        f"<p>{len(result['runs'])} trainings on made scenes of 100 x 100 pixels. Time runs from reading the data to "
-        "the end of a step; looking at test views is left out. Every plan is as long as the chart.</p>",
+        f"<p>{len(result['runs'])} trainings, images of {result['settings']['pixels']} pixels a side. Time runs from "
+        "reading the data to the end of a step; looking at test views is left out. Every plan is as long as the "
+        "chart.</p>",
         *(figure(path, CAPTIONS[path.stem]) for path in pictures),
         "<h2>The front</h2>",
         grid(("seconds", "best", "dB", f"{VARIANTS[RECOMMENDED].label} behind it"), front),

@@ -45,6 +45,8 @@ class Scale:
     """Of training; the plan, which learning rate and phases follow, is as long."""
     threads: int = 1
     """Of a training. One: seconds are the CPU's; more: seconds of the clock on the wall."""
+    pixels: int = 100
+    """Longer side of the images."""
 
     @property
     def clock(self) -> Callable[[], float]:
