@@ -350,7 +350,7 @@ def _train(trainer: Any) -> None:
     """Train and say where the result is."""
     from edge_se_sampler.engine.session import summary
 
-    print(summary(trainer.config, trainer.run), flush=True)
+    print(summary(trainer), flush=True)
     trainer.train()
     if trainer.stop_requested:
         _leave(

@@ -6,19 +6,22 @@ Torch-free, so that `--help` need not wait for torch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, TypeVar
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import PixelSamplerConfig
+
+Settings = TypeVar("Settings", bound="SamplingSettings")
 
 
 @dataclass
 class SamplingSettings:
     """Which pixels train the network, early and late. Early and late together cover the paper's six strategies."""
 
-    early: Literal["uniform", "precrop", "edge"] = "edge"
-    """How pixels are drawn in the early phase: all alike, from the centred box, or in proportion to edge strength."""
+    early: Literal["uniform", "precrop", "edge"] | None = "edge"
+    """How pixels are drawn in the early phase: all alike, from the centred box, or in proportion to edge strength. Left
+    open (lean-nerf): by edges as long as they pay, but all alike where alpha tells where the object is."""
     late: Literal["uniform", "se"] = "se"
     """How pixels are drawn afterwards: all alike, or by the rank of their squared error among uniform candidates."""
     schedule: Literal["fraction", "steps", "auto"] = "fraction"
@@ -49,6 +52,14 @@ class SamplingSettings:
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of them."""
 
+    def decided(self: Settings, located: bool) -> Settings:
+        """With `early`, if it was left open, decided by whether it is known where the object is."""
+        if self.early is not None:
+            return self
+        if located and self.schedule != "auto":
+            return replace(self, early="uniform")
+        return replace(self, early="edge", schedule="auto")
+
     def check(self) -> None:
         """Raise InputError for a value or a combination that has no meaning."""
 
@@ -63,6 +74,8 @@ class SamplingSettings:
             refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
         if self.schedule != "steps" and self.early_steps:
             refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
+        if self.early is None:
+            refuse("early", "nothing here decides it; must be uniform, precrop or edge")
         if self.schedule == "auto" and self.early != "edge":
             refuse("schedule", "'auto' asks whether edges pay: it needs early edge")
         if not 1e-6 <= self.edge_epsilon <= 1e6:

@@ -14,12 +14,13 @@ import torch
 from tiny import check_gradients, tiny_model, tiny_rays
 from torch import Tensor
 
+from edge_se_sampler.bench.chart.variant import SAMPLER, changed
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import load_model, prepare
+from edge_se_sampler.engine.session import load_model, prepare, summary
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.nerf import lean
@@ -243,6 +244,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     model = trainer.pipeline.model
     views = trainer.pipeline.datamanager
     assert not bool(views.image_batch["mask"].all())  # live pixels alone
+    assert views.train_pixel_sampler.strategy == "uniform"
     trainer.train()
     picture = pictures_of(read_blender(larger, "test"))[0]
     _, psnr = render_view(model, picture)
@@ -255,12 +257,23 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     assert torch.equal(render_rays(again, rays), render_rays(model, rays))
 
 
-def test_without_alpha_it_trains_on_all_pixels(larger: Path, tmp_path: Path) -> None:
+def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
     assert len(trainer.pipeline.model.features.table) > 50_000
-    assert "mask" not in trainer.pipeline.datamanager.image_batch
+    views = trainer.pipeline.datamanager
+    assert "mask" not in views.image_batch
     loss = [trainer.train_iteration(step) for step in range(3)]
     assert all(np.isfinite(loss))
+    assert (views.train_pixel_sampler.strategy, views.train_pixel_sampler.watch.observations) == ("edge", 3)
+    assert "pixels   edge until the object is learnt, then uniform" in summary(trainer)
+
+
+@pytest.mark.parametrize("by_alpha", [True, False])
+def test_pixels_that_were_chosen_stay_chosen(by_alpha: bool, larger: Path, tmp_path: Path) -> None:
+    config = lean_config(larger, tmp_path, cull_by_alpha=by_alpha)
+    chosen = "edge" if by_alpha else "uniform"
+    sampler = prepare(changed(config, f"{SAMPLER}.early", chosen)).pipeline.datamanager.train_pixel_sampler
+    assert (sampler.strategy, sampler.config.schedule) == (chosen, "fraction")
 
 
 def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_se: Any) -> None:

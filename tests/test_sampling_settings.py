@@ -25,6 +25,7 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
         for early in ("uniform", "precrop")
     ],
     *[("se-scoring", {"se_scoring": scoring, "late": "uniform"}) for scoring in ("coarse", "memory")],
+    ("early", {"early": None}),
 ]
 
 
@@ -65,6 +66,24 @@ def test_accepted_to_the_very_limits(settings: dict[str, Any]) -> None:
     made = SamplingSettings(**settings)
     made.check()
     assert made == SamplingSettings(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "located", "early", "schedule"),
+    [
+        ({"early": None}, True, "uniform", "fraction"),
+        ({"early": None}, False, "edge", "auto"),
+        ({"early": None, "schedule": "auto"}, True, "edge", "auto"),  # somebody wants to watch
+        ({"early": "precrop"}, True, "precrop", "fraction"),
+        ({"early": "uniform"}, False, "uniform", "fraction"),
+    ],
+)
+def test_what_is_left_open_is_decided_by_whether_the_object_is_located(
+    settings: dict[str, Any], located: bool, early: str, schedule: str
+) -> None:
+    decided = EdgeSEPixelSamplerConfig(**settings).decided(located)
+    assert (decided.early, decided.schedule) == (early, schedule)
+    decided.check()
 
 
 def test_defaults_are_the_papers_edge_and_squared_error() -> None:

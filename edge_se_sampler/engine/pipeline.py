@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from edge_se_sampler.data.blender import Views
@@ -11,6 +11,7 @@ from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.nerf.economy import live_pixels, needs
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 from edge_se_sampler.nerf.ray_model import RayModel
+from edge_se_sampler.sampling_settings import SamplingSettings
 from edge_se_sampler.streams import Stream, stream
 
 SHADES = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
@@ -29,13 +30,17 @@ class Pipeline:
     def build(cls, config: TrainerConfig, views: Views, device: str) -> Pipeline:
         """Set up both for a planned config."""
         model_config = config.pipeline.model
+        manager_config, located = config.pipeline.datamanager, False
         model = build_model(config, device)
         if model.needs_cells:
             told = needs(views, model_config)
             model.settle(OccupancyGrid.of(told.hull))
-            if config.pipeline.datamanager.live_pixels_only and told.silhouettes:
+            located = told.silhouettes > 0
+            if manager_config.live_pixels_only and located:
                 views = views.masked(live_pixels(views, told.hull))
-        datamanager = config.pipeline.datamanager.setup(
+        if isinstance(manager_config.pixel_sampler, SamplingSettings):
+            manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.decided(located))
+        datamanager = manager_config.setup(
             views=views, device=device, background_color=SHADES[model_config.background_color]
         )
         return cls(datamanager, model)

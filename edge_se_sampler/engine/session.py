@@ -121,15 +121,12 @@ def chosen_views(config: TrainerConfig, count: int) -> list[int] | None:
     return list(config.views)
 
 
-def summary(config: TrainerConfig, run: RunFolder) -> str:
+def summary(trainer: Trainer) -> str:
     """A planned run in a few lines."""
-    model, manager, sampler = (
-        config.pipeline.model,
-        config.pipeline.datamanager,
-        config.pipeline.datamanager.pixel_sampler,
-    )
+    config, manager = trainer.config, trainer.pipeline.datamanager.config
+    model, sampler = config.pipeline.model, manager.pixel_sampler
     lines = [
-        f"run      {run.path}",
+        f"run      {trainer.run.path}",
         f"model    {model.size}: {model.depth} x {model.width}, {_samples(model)}",
         f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
     ]
@@ -137,7 +134,8 @@ def summary(config: TrainerConfig, run: RunFolder) -> str:
         until = "until the object is learnt"
         if sampler.schedule != "auto":
             until = f"for {math.ceil(sampler.early_length(config.max_num_iterations or 0))} iterations"
-        lines.append(f"pixels   {sampler.early} {until}, then {sampler.late}")
+        early = "" if sampler.early == sampler.late else f"{sampler.early} {until}, then "
+        lines.append(f"pixels   {early}{sampler.late}")
     return "\n".join(lines)
 
 

@@ -58,6 +58,10 @@ VARIANTS: dict[str, Variant] = {
     "lean-one-image": Variant("sampling", "one image a step", changes={f"{SAMPLER}.images_per_step": "one"}),
     "all-pixels": Variant("economy", "dead pixels too", changes={f"{MANAGER}.live_pixels_only": False}),
     "no-hull": Variant("economy", "no hull", changes={f"{MODEL}.cull_by_alpha": False}),
+    "no-hull-uniform": Variant(
+        "economy", "no hull, pixels uniform",
+        changes={f"{MODEL}.cull_by_alpha": False, f"{SAMPLER}.early": "uniform"},
+    ),
     "no-density": Variant("economy", "no density culling", changes={f"{MODEL}.cull_by_density": False}),
     "economy-off": Variant("economy", "economy off", changes={f"{MODEL}.economy": "off"}),
     "no-features": Variant(
