@@ -19,6 +19,7 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
+from edge_se_sampler.engine.inspection import inspect
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, prepare, summary
 from edge_se_sampler.errors import InputError
@@ -319,5 +320,8 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     live = live_pixels(read_blender(larger, "train"), told.hull)
     assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
+    assert said["sampling"].startswith("uniform")
+    unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
+    assert "by edges as long as they pay" in unlocated
     for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf"), ("--step-cells", "1e-5")):
         assert edge_se("inspect", "--data", larger, flag, value).code == 2

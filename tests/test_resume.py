@@ -33,11 +33,13 @@ lean.FORGET_AT = lean.JUDGE_EVERY = 5
 if what == "resume":
     trainer = prepare_resume(RunFolder(place))
 else:
-    config = registered_methods()[method].specification.config
+    config = registered_methods()[method.removesuffix(" without alpha")].specification.config
     changes = {"early_fraction": 0.7}
     samples = {"num_coarse_samples": 8, "num_importance_samples": 8, "density_noise": 0.1}
     if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered
         changes, samples = {"early": "edge", "late": "se", "se_scoring": "memory", "early_fraction": 0.3}, {}
+    if method == "lean-nerf without alpha":  # where the early phase is decided again, and watched
+        changes, samples = {}, {"cull_by_alpha": False}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **changes)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
     model = replace(config.pipeline.model, **samples)
@@ -97,6 +99,7 @@ def state(run: Path) -> dict[str, bytes | float | str]:
         ("edge-se-nerf", 8),  # in the edge phase
         pytest.param("edge-se-nerf", 16, marks=pytest.mark.slow),  # in the SE phase
         ("lean-nerf", 12),
+        ("lean-nerf without alpha", 12),
     ],
 )
 def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, interrupt_at: int):

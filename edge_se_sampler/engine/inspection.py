@@ -60,6 +60,9 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
         f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)",
         "rays": f"{100 * across:.1f} % of the pixels may cross them; such a ray has {samples:.1f} samples, {along:.0f} "
         "along all of its depth",
+        "sampling": "uniform among them"
+        if told.silhouettes
+        else "by edges as long as they pay, for nothing tells where the object is",
     }
     return [f"{name:<13}{what}" for name, what in said.items()]
 
