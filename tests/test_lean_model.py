@@ -187,6 +187,25 @@ def test_judgements_are_a_function_of_the_seed() -> None:
 # -- state
 
 
+@pytest.mark.parametrize("count", [6, 40])
+def test_a_box_of_which_nothing_is_known_can_be_seen_through_at_first(count: int) -> None:
+    size = 3.0
+    cube = Hull(np.full(3, -size / 2), size / count, np.ones((count, count, count), dtype=bool))
+    model = LeanModel(LeanModelConfig("tiny", 32, 1, 4, 2), np.random.default_rng(0))
+    fog = LeanModel(LeanModelConfig("tiny", 32, 1, 4, 2), np.random.default_rng(0))
+    cube.cells[: count // 2] = False  # carved
+    fog.settle(OccupancyGrid.of(cube))
+    cube.cells[:] = True
+    model.settle(OccupancyGrid.of(cube))
+    rays = tiny_rays(RAYS, dtype=torch.float32)
+    met = model.eval()(rays)["accumulation_fine"]
+    assert 0.3 < float(met.detach().max()) < 0.9
+    assert float(fog.eval()(rays)["accumulation_fine"].detach().max()) > 0.8
+    again = LeanModel(LeanModelConfig("tiny", 32, 1, 4, 2), np.random.default_rng(1))
+    again.load_state_dict(model.state_dict())
+    assert torch.equal(again.eval()(rays)["accumulation_fine"], met)
+
+
 def test_a_state_brings_its_cells() -> None:
     model = model_in(ball())
     cells(model).occupied[3] = False

@@ -25,7 +25,11 @@ from edge_se_sampler.nerf.ray_model import RayModel
 
 RAYS_PER_CHUNK = 4096
 START = -1.0
-"""Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient."""
+"""Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient. In a box of which
+nothing is known it would be an opaque fog: there, the box has an optical depth of 1 across. (Bricks without alpha, seed
+2: after 15 CPU seconds 13.8 and 27.9 dB.)"""
+WHOLE = 0.9
+"""Share of a box's cells from which on nothing is known of it."""
 LARGEST = 8.0
 """Raw density above which a cell is opaque whatever it is."""
 JUDGE_EVERY, FORGET_AT = 128, 128
@@ -112,8 +116,12 @@ class LeanModel(RayModel):
         return True
 
     def settle(self, grid: OccupancyGrid) -> None:
-        """Features at the corners of the grid's cells."""
+        """Features at the corners of the grid's cells, and a density to begin with."""
         super().settle(grid)
+        inside = grid.possible[1:-1, 1:-1, 1:-1]
+        if inside.float().mean() > WHOLE:
+            with torch.no_grad():
+                self.fine.density.bias -= math.log(max(inside.shape)) + START
         if self.config.features:
             self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
 
