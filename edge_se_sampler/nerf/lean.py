@@ -121,7 +121,7 @@ class LeanModel(RayModel):
         inside = grid.possible[1:-1, 1:-1, 1:-1]
         if inside.float().mean() > WHOLE:
             with torch.no_grad():
-                self.fine.density.bias -= math.log(max(inside.shape)) + START
+                self.fine.density.bias.sub_(math.log(max(inside.shape)) + START)
         if self.config.features:
             self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
 
