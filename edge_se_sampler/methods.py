@@ -51,7 +51,7 @@ def _specification(name: str) -> MethodSpecification:
 
 def _lean() -> MethodSpecification:
     """What we recommend."""
-    sampler = EdgeSEPixelSamplerConfig(early=None, late="uniform", images_per_step="all")
+    sampler = EdgeSEPixelSamplerConfig(early="auto", late="uniform", images_per_step="all")
     manager = VanillaDataManagerConfig(live_pixels_only=True, pixel_sampler=sampler)
     pipeline, adam = PipelineConfig(manager, LeanModelConfig()), OptimizerConfig(eps=1e-15, fused=True)
     config = TrainerConfig(method_name=LEAN, pipeline=pipeline, optimizer=adam)

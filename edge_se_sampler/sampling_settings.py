@@ -19,9 +19,9 @@ Settings = TypeVar("Settings", bound="SamplingSettings")
 class SamplingSettings:
     """Which pixels train the network, early and late. Early and late together cover the paper's six strategies."""
 
-    early: Literal["uniform", "precrop", "edge"] | None = "edge"
-    """How pixels are drawn in the early phase: all alike, from the centred box, or in proportion to edge strength. Left
-    open (lean-nerf): by edges as long as they pay, but all alike where alpha tells where the object is."""
+    early: Literal["uniform", "precrop", "edge", "auto"] = "edge"
+    """How pixels are drawn in the early phase: all alike, from the centred box, or in proportion to edge strength.
+    Or auto (lean-nerf's): by edges as long as they pay, but all alike where alpha tells where the object is."""
     late: Literal["uniform", "se"] = "se"
     """How pixels are drawn afterwards: all alike, or by the rank of their squared error among uniform candidates."""
     schedule: Literal["fraction", "steps", "auto"] = "fraction"
@@ -53,8 +53,8 @@ class SamplingSettings:
     power of them."""
 
     def decided(self: Settings, located: bool) -> Settings:
-        """With `early`, if it was left open, decided by whether it is known where the object is."""
-        if self.early is not None:
+        """With an `early` of auto decided by whether it is known where the object is."""
+        if self.early != "auto":
             return self
         if located and self.schedule != "auto":
             return replace(self, early="uniform")
@@ -74,7 +74,7 @@ class SamplingSettings:
             refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
         if self.schedule != "steps" and self.early_steps:
             refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
-        if self.early is None:
+        if self.early == "auto":
             refuse("early", "nothing here decides it; must be uniform, precrop or edge")
         if self.schedule == "auto" and self.early != "edge":
             refuse("schedule", "'auto' asks whether edges pay: it needs early edge")

@@ -107,6 +107,6 @@ def test_help_is_complete_and_comes_without_torch(command: str):
     assert time.monotonic() - began < 10  # the bar is 1.5 s; this only catches a heavy import on a busy machine
     flags = told.count("--")
     if command == "train edge-se-nerf":
-        assert "--pipeline.datamanager.pixel-sampler.early {uniform,precrop,edge}" in told
+        assert "--pipeline.datamanager.pixel-sampler.early {uniform,precrop,edge,auto}" in told
         assert flags > 35
     assert "usage: edge-se" in told

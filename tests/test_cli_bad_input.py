@@ -93,7 +93,7 @@ def test_nothing_left_in_the_crop(scene: Path, tmp_path: Path, edge_se):
 
 SETTINGS = [
     (["--pipeline.datamanager.pixel-sampler.erly", "edge"], "pixel-sampler.early"),
-    (["--pipeline.datamanager.pixel-sampler.early", "edgy"], "'uniform', 'precrop', 'edge'"),
+    (["--pipeline.datamanager.pixel-sampler.early", "edgy"], "'uniform', 'precrop', 'edge', 'auto'"),
     (["--pipeline.datamanager.pixel-sampler.early-fraction", "1.5"], "early-fraction"),
     (["--pipeline.datamanager.pixel-sampler.early-steps", "9"], "schedule"),
     (["--pipeline.datamanager.pixel-sampler.edge-epsilon", "0"], "edge-epsilon"),

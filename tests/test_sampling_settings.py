@@ -25,7 +25,7 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
         for early in ("uniform", "precrop")
     ],
     *[("se-scoring", {"se_scoring": scoring, "late": "uniform"}) for scoring in ("coarse", "memory")],
-    ("early", {"early": None}),
+    ("early", {"early": "auto"}),
 ]
 
 
@@ -71,14 +71,14 @@ def test_accepted_to_the_very_limits(settings: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("settings", "located", "early", "schedule"),
     [
-        ({"early": None}, True, "uniform", "fraction"),
-        ({"early": None}, False, "edge", "auto"),
-        ({"early": None, "schedule": "auto"}, True, "edge", "auto"),  # somebody wants to watch
+        ({"early": "auto"}, True, "uniform", "fraction"),
+        ({"early": "auto"}, False, "edge", "auto"),
+        ({"early": "auto", "schedule": "auto"}, True, "edge", "auto"),  # somebody wants to watch
         ({"early": "precrop"}, True, "precrop", "fraction"),
         ({"early": "uniform"}, False, "uniform", "fraction"),
     ],
 )
-def test_what_is_left_open_is_decided_by_whether_the_object_is_located(
+def test_what_is_automatic_is_decided_by_whether_the_object_is_located(
     settings: dict[str, Any], located: bool, early: str, schedule: str
 ) -> None:
     decided = EdgeSEPixelSamplerConfig(**settings).decided(located)
