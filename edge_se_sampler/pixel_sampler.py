@@ -56,7 +56,7 @@ class ImportantPixels:
 
     def __init__(self, config: Any, **kwargs: Any) -> None:
         # hosts share one config between training and evaluation, and write into it
-        super().__init__(copy.copy(config), **kwargs)  # pyright: ignore[reportCallIssue]
+        super().__init__(copy.copy(config).decided(), **kwargs)  # pyright: ignore[reportCallIssue]
         self.config.check()
         # RGB that edges are taken in front of; fixed once a table of edges exists
         self.background: tuple[float, float, float] = kwargs.get("background_color") or WHITE

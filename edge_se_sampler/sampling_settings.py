@@ -52,8 +52,8 @@ class SamplingSettings:
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of them."""
 
-    def decided(self: Settings, located: bool) -> Settings:
-        """With an `early` of auto decided by whether it is known where the object is."""
+    def decided(self: Settings, located: bool = False) -> Settings:
+        """With an `early` of auto decided by whether it is known where the object is; `check` comes after."""
         if self.early != "auto":
             return self
         if located and self.schedule != "auto":
@@ -74,8 +74,6 @@ class SamplingSettings:
             refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
         if self.schedule != "steps" and self.early_steps:
             refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
-        if self.early == "auto":
-            refuse("early", "nothing here decides it; must be uniform, precrop or edge")
         if self.schedule == "auto" and self.early != "edge":
             refuse("schedule", "'auto' asks whether edges pay: it needs early edge")
         if not 1e-6 <= self.edge_epsilon <= 1e6:

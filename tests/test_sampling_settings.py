@@ -25,7 +25,6 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
         for early in ("uniform", "precrop")
     ],
     *[("se-scoring", {"se_scoring": scoring, "late": "uniform"}) for scoring in ("coarse", "memory")],
-    ("early", {"early": "auto"}),
 ]
 
 
@@ -81,9 +80,12 @@ def test_accepted_to_the_very_limits(settings: dict[str, Any]) -> None:
 def test_what_is_automatic_is_decided_by_whether_the_object_is_located(
     settings: dict[str, Any], located: bool, early: str, schedule: str
 ) -> None:
-    decided = EdgeSEPixelSamplerConfig(**settings).decided(located)
+    config = EdgeSEPixelSamplerConfig(**settings)
+    decided = config.decided(located)
     assert (decided.early, decided.schedule) == (early, schedule)
     decided.check()
+    if not located:  # nor does a sampler know by itself
+        assert config.setup().config == decided
 
 
 def test_defaults_are_the_papers_edge_and_squared_error() -> None:
