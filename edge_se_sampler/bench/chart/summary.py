@@ -25,9 +25,10 @@ def scenes_of(runs: list[Run]) -> list[str]:
 
 
 def at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
-    """PSNR at a moment of training, between looks by the logarithm of time; None before the first look."""
+    """PSNR at a moment of training, between looks by the logarithm of time; None before the first look,
+    which comes a step late."""
     times, psnr = [point[0] for point in curve], [point[-1] for point in curve]
-    if not times or seconds < times[0] * 0.999:
+    if not times or seconds < times[0] * 0.99:
         return None
     return float(np.interp(np.log(seconds), np.log(times), psnr))
 
