@@ -25,6 +25,7 @@ from edge_se_sampler.bench.chart.summary import (
 )
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
 from edge_se_sampler.bench.chart.variant import VARIANTS, Cell, cells, changed, config_of
+from edge_se_sampler.bench.experiment import alone
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.made import make_scenes
 from edge_se_sampler.engine.plan import planned
@@ -87,8 +88,12 @@ def test_a_run_is_planned_to_fill_its_time_and_is_looked_at_on_the_way(
     assert run["steps"] <= run["planned_steps"]
     assert 0.2 < run["seconds"] < 10  # on a busy machine too
     assert 0 < run["ready_seconds"] < run["curve"][0][0]
-    assert run["peak_bytes"] > 2**22  # of the trial of its steps too
     assert json.loads(json.dumps(run)) == run
+
+
+def test_memory_is_a_trainings_own(made: Path) -> None:
+    run = alone(run_cell, Cell("lean", "mic", 1), Scale(seconds=1), made)  # a process has one peak in its life
+    assert run["peak_bytes"] > 2**22  # of the trial of its steps too
 
 
 @pytest.mark.parametrize("guess", [10, 100_000])
