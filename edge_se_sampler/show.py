@@ -78,7 +78,7 @@ def _show_view(axes, views: Views, k: int, p: np.ndarray, strategy: str, count: 
         if image.shape[2] == 4:
             inside = (image[drawn[:, 1], drawn[:, 2], 3] > 0).mean()
             covered = (image[..., 3] > 0).mean()
-            caption = f"{count} drawn: {inside:.0%} on the object, {covered:.0%} of the image"
+            caption = f"{count} drawn: {inside:.0%} on the object,\nwhich covers {covered:.0%} of the image"
     axes[2].set_title(caption, fontsize=9)
     for axis in axes:
         axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
