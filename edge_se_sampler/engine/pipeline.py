@@ -34,7 +34,7 @@ class Pipeline:
         model = build_model(config, device)
         if model.needs_cells:
             told = needs(views, model_config)
-            model.settle(OccupancyGrid.of(told.hull))
+            model.settle(OccupancyGrid.of(told.hull, told.splits))
             located = told.silhouettes > 0
             if manager_config.live_pixels_only and located:
                 views = views.masked(live_pixels(views, told.hull))

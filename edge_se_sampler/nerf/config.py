@@ -73,6 +73,11 @@ class LeanModelConfig(ModelConfig):
     feature_rate: float = 6.0
     """Learning rate of the features, in the network's."""
 
+    @property
+    def learns_cells(self) -> bool:
+        """Whether training tells which cells are empty."""
+        return self.economy == "auto" and self.cull_by_density
+
 
 @dataclass(frozen=True)
 class InfoNeRFModelConfig(NeRFModelConfig):

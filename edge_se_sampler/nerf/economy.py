@@ -27,11 +27,8 @@ from edge_se_sampler.nerf.hull import (
     projected,
     silhouettes,
 )
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.occupancy import MOST_CELLS, OccupancyGrid
 
-MOST_CELLS = 2**18
-"""More cost more than they tell: with four times as many, bricks at 400 pixels ends after 100 CPU seconds at 33.14 dB,
-not 34.41."""
 MOST_PLACES = 2**24
 """Cells of the box around them, which grids have a number for, occupied or not."""
 TOLERATED = 0.01
@@ -52,40 +49,54 @@ class Needs:
     """Views whose alpha tells the object from the background."""
     hull: Hull
     """The cells that may hold something."""
+    splits: int
+    """How often training may halve their sides, where it finds something."""
 
 
 def needs(views: Views, config: ModelConfig) -> Needs:
     """Derive what training views need under a resolved config.
 
+    Where nothing is carved away and training is to tell which cells are empty, it begins with large ones, few enough
+    for each to be split.
+
     Raises:
         InputError: the cameras see nothing of what they look at.
     """
-    by_alpha = config.economy == "auto" and not (isinstance(config, LeanModelConfig) and not config.cull_by_alpha)
+    lean = config if isinstance(config, LeanModelConfig) else None
+    by_alpha = config.economy == "auto" and (lean is None or lean.cull_by_alpha)
+    at_first = MOST_CELLS // 8 if lean is not None and lean.learns_cells else MOST_CELLS
     box = box_of(views, config.near, config.far)
     pixel = footprint(views, box)
+    side = config.cell_pixels * pixel
     shown = silhouettes(views) if by_alpha else {}
-    hull = _hull(views, shown, box, config.cell_pixels * pixel)
+    hull = _hull(views, shown, box, side, MOST_CELLS if shown else at_first)
     if shown and (hull is None or _missed(views, shown, hull) > TOLERATED):
         print(
             "the views' alpha masks do not agree on where the object is, or show too little of it: they carve nothing "
             "away",
             file=sys.stderr,
         )
-        shown, hull = {}, _hull(views, {}, box, config.cell_pixels * pixel)
+        shown, hull = {}, _hull(views, {}, box, side, at_first)
     if hull is None:
         raise InputError(
             "no training view sees anything of what lies between --pipeline.model.near and far around "
             f"({', '.join(f'{x:.2f}' for x in box.middle)}): check the cameras' poses and principal points"
         )
-    return Needs(box, pixel, len(shown), hull)
+    return Needs(box, pixel, len(shown), hull, 0 if shown or at_first == MOST_CELLS else _splits(hull, side))
 
 
-def _hull(views: Views, shown: dict[int, Silhouette], box: Box, side: float) -> Hull | None:
-    """Of cells of that side, or larger ones where there would be too many; None if nothing is left."""
+def _splits(hull: Hull, side: float) -> int:
+    """How often cells are to be halved to come to a side; no more often than there are numbers for them."""
+    wanted, possible = np.log2(hull.side / side), np.log2(MOST_PLACES / hull.cells.size) / 3
+    return max(0, int(min(np.round(wanted), np.floor(possible))))
+
+
+def _hull(views: Views, shown: dict[int, Silhouette], box: Box, side: float, most: int) -> Hull | None:
+    """Of cells of that side, or larger ones where there would be more than `most`; None if nothing is left."""
     rough = carve(views, shown, box, 2 * box.half / ROUGH)
     if rough is None:
         return None
-    volume = max(rough.cells.sum() / MOST_CELLS, rough.cells.size / MOST_PLACES) * rough.side**3
+    volume = max(rough.cells.sum() / most, rough.cells.size / MOST_PLACES) * rough.side**3
     return carve(views, shown, box, max(side, float(np.cbrt(volume))))
 
 

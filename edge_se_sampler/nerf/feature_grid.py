@@ -1,7 +1,11 @@
 """Features at the corners of occupied cells, interpolated in between; nothing is stored elsewhere.
 
-V   corners of possible cells
-m   points, each in a cell
+There are two levels: cells as they were at first, all that are possible, and those of today's cells that were split for
+more detail. A point has the features of the finest level that has its cell: what was wrongly taken to be empty is
+coarser, but not lost.
+
+V   corners of cells, of both levels
+m   points, each in a possible cell
 F   features of a corner
 """
 
@@ -23,38 +27,93 @@ class FeatureGrid(nn.Module):
         size: F.
     """
 
-    offsets: Tensor
-    """(8,) int64: how much farther in `place` each corner of a cell is than its first."""
+    owned: Tensor
+    """(X, Y, Z) bool: today's cells that have corners of their own level."""
     place: Tensor
-    """((X + 1) (Y + 1) (Z + 1),) int64: row of each corner in the table; that of no cell's: any."""
+    """Row of each corner in the table, the first level's (X + 1) (Y + 1) (Z + 1) and then the second's; that of no
+    cell's: any."""
+    start: Tensor
+    """(2,) int64: where each level begins in `place`."""
+    stride: Tensor
+    """(2, 3) int64: how much farther in `place` the next corner is, along each axis."""
+    offsets: Tensor
+    """(2, 8) int64: the same for each corner of a cell."""
 
     def __init__(self, grid: OccupancyGrid, size: int) -> None:
         super().__init__()
         self.grid = [grid]  # not a part of this one
-        corners = torch.zeros([length + 1 for length in grid.possible.shape], dtype=torch.bool)
-        shape = grid.possible.shape
-        for i, j, k in _CORNERS:
-            corners[i : i + shape[0], j : j + shape[1], k : k + shape[2]] |= grid.possible.cpu()
-        place = corners.reshape(-1).cumsum(0) - 1
-        self.register_buffer("place", place.clamp(min=0), persistent=False)
-        self.table = nn.Parameter(torch.zeros(int(corners.sum()), size))
-        _, wide, deep = corners.shape
-        offsets = torch.tensor([(i * wide + j) * deep + k for i, j, k in _CORNERS])
-        self.register_buffer("offsets", offsets, persistent=False)
+        self.register_buffer("owned", torch.zeros_like(grid.possible))
+        self.table = nn.Parameter(torch.zeros(self._lay_out(), size))
 
-    def forward(self, positions: Tensor) -> Tensor:
-        """(m, 3) world units, in possible cells -> (m, F)."""
+    @torch.no_grad()
+    def own(self, owned: Tensor) -> None:
+        """Give cells corners of their own, which begin with what is known there. The table gets another size.
+
+        Args:
+            owned: (X, Y, Z) bool; twice as many along each axis as there are today: the grid is split first.
+        """
         (grid,) = self.grid
-        at = (positions - grid.corner) / grid.side
+        sides = (grid.first_side, grid.side * len(grid.possible) / len(owned))
+        shown = zip((grid.possible_at_first, owned), sides, strict=True)
+        where = torch.cat([grid.corner + torch.nonzero(_corners(cells)) * side for cells, side in shown])
+        known = self(where, grid.locate(where))
+        if len(owned) > len(grid.possible):
+            grid.split()
+        self.owned = owned
+        self._lay_out()
+        self.table.data, self.table.grad = known, None
+
+    def forward(self, positions: Tensor, cell: Tensor) -> Tensor:
+        """(m, 3) world units and (m,) int64 numbers of their cells, possible ones -> (m, F)."""
+        (grid,) = self.grid
+        level = self.owned.reshape(-1)[cell].long()
+        at = (positions - grid.corner) / torch.stack((grid.first_side, grid.side))[level][:, None]
         low = at.floor()
         share = at - low
-        low = low.long()
-        _, wide, deep = (length + 1 for length in grid.possible.shape)
-        corner = (low[:, 0] * wide + low[:, 1]) * deep + low[:, 2]
-        rows = self.place[corner[:, None] + self.offsets]
+        corner = self.start[level] + (low.long() * self.stride[level]).sum(dim=1)
+        rows = self.place[corner[:, None] + self.offsets[level]]
         x, y, z = torch.stack((1 - share, share), dim=2).unbind(1)
         weight = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(-1, 8)
         return _Weighted.apply(self.table, rows, weight)
+
+    def _lay_out(self) -> int:
+        """Find a row for every corner of both levels; how many that takes."""
+        (grid,) = self.grid
+        places, starts, strides, rows, size = [], [], [], 0, 0
+        for cells in (grid.possible_at_first, self.owned):
+            corners = _corners(cells)
+            if places and not cells.any():  # nothing was split: spare the memory
+                corners = corners[:0]
+            _, wide, deep = corners.shape
+            starts.append(size)
+            strides.append((wide * deep, deep, 1))
+            places.append((corners.reshape(-1).cumsum(0) - 1).clamp(min=0) + rows)
+            rows, size = rows + int(corners.sum()), size + corners.numel()
+        device = self.owned.device
+        stride = torch.tensor(strides, device=device)
+        self.register_buffer("place", torch.cat(places), persistent=False)
+        self.register_buffer("start", torch.tensor(starts, device=device), persistent=False)
+        self.register_buffer("stride", stride, persistent=False)
+        offsets = (stride[:, None] * torch.tensor(_CORNERS, device=device)).sum(dim=2)
+        self.register_buffer("offsets", offsets, persistent=False)
+        return rows
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """As torch's; the state's cells have corners of their own from now on."""
+        owned = state_dict.get(f"{prefix}owned")
+        if owned is not None and not torch.equal(owned.cpu(), self.owned.cpu()):
+            self.owned = owned.to(self.owned.device)
+            self.table.data = self.table.new_zeros(self._lay_out(), self.table.shape[1])
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _corners(cells: Tensor) -> Tensor:
+    """(X + 1, Y + 1, Z + 1) bool: corners of cells (X, Y, Z) bool."""
+    x, y, z = cells.shape
+    corners = torch.zeros((x + 1, y + 1, z + 1), dtype=torch.bool, device=cells.device)
+    for i, j, k in _CORNERS:
+        corners[i : i + x, j : j + y, k : k + z] |= cells
+    return corners
 
 
 _CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]

@@ -1,6 +1,6 @@
 """The lean model: one small network on features kept where the scene is.
 
-h       side of a cell, world units
+h       side of a cell before any split, world units
 sigma   exp(raw) / h: of its own scale, never 0, so that no network can die
 """
 
@@ -19,7 +19,7 @@ from edge_se_sampler.nerf.config import LeanModelConfig
 from edge_se_sampler.nerf.encoding import encoded_size, positional_encoding
 from edge_se_sampler.nerf.feature_grid import FeatureGrid
 from edge_se_sampler.nerf.field import initialize_all, linear
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.occupancy import MOST_CELLS, OccupancyGrid, halved
 from edge_se_sampler.nerf.packed import render_packed, spread, sum_rays, transmittance
 from edge_se_sampler.nerf.ray_model import RayModel
 
@@ -32,13 +32,19 @@ WHOLE = 0.9
 """Share of a box's cells from which on nothing is known of it."""
 LARGEST = 8.0
 """Raw density above which a cell is opaque whatever it is."""
-JUDGE_EVERY, FORGET_AT = 128, 128
-"""Steps: cells are long enough seen to be judged; densities have begun to mean something, what was seen before does
-not count."""
+JUDGE_EVERY = 128
+"""Steps in which cells are seen long enough to be judged; half as many do as long as they are large. What was seen in
+the first does not count: densities mean nothing yet."""
 LEAST_OPACITY = 0.01
-"""Of a cell: below, it is taken to be empty."""
+"""Of the smallest cell that there may be: below, it is taken to be empty."""
+SOLID = 0.5
+"""Optical depth of a cell: as long as none in a box of which nothing was known has it, nothing is learnt, and nothing
+judged."""
 TRIED_AGAIN = 0.02
 """Share of the empty cells that are tried again until the next judgement."""
+MISJUDGED = 0.05
+"""Cells that turn out to be dense beside those that were split, as a share of them, from which on they get corners of
+their own, too."""
 
 
 class LeanField(nn.Module):
@@ -134,32 +140,48 @@ class LeanModel(RayModel):
     def begin_step(self, step: int, seed: int) -> None:
         """As `RayModel`; now and then, cells that have shown no density are left out."""
         super().begin_step(step, seed)
-        if self.grid is None or not self._learns_cells or step % JUDGE_EVERY:
+        grid = self.grid
+        if grid is None or not self.config.learns_cells:
             return
-        if step == FORGET_AT:
-            self.grid.largest.zero_()
-        elif step > FORGET_AT:
-            again = torch.rand(self.grid.possible.shape, generator=self.random, device=self.device) < TRIED_AGAIN
-            self.grid.judge(-math.log1p(-LEAST_OPACITY) / float(self.grid.side), again)
+        large = bool(grid.splits[1])
+        every = JUDGE_EVERY // 2 if large else JUDGE_EVERY
+        if step < every or step % every:
+            return
+        if step == every or (large and float(grid.largest.max() * grid.side) < SOLID):
+            grid.largest.zero_()
+            return
+        share = TRIED_AGAIN / 2 ** int(grid.splits[0])
+        again = torch.rand(grid.possible.shape, generator=self.random, device=self.device) < share
+        self._refine(grid, grid.judge(-math.log1p(-LEAST_OPACITY) / float(grid.finest_side), again))
 
-    @property
-    def _learns_cells(self) -> bool:
-        return self.config.economy == "auto" and self.config.cull_by_density
+    def _refine(self, grid: OccupancyGrid, kept: Tensor) -> None:
+        """Split the cells that are kept, once they are few enough; see to those that were left out by mistake.
+
+        Args:
+            kept: (X, Y, Z) bool.
+        """
+        features = self.features
+        if grid.splits[1] and 8 * int(kept.sum()) <= MOST_CELLS:
+            grid.split() if features is None else features.own(halved(kept))
+        elif features is not None and grid.splits[0]:
+            owned = features.owned | kept
+            more = int((owned ^ features.owned).sum())
+            if more > MISJUDGED * int(features.owned.sum()) and int(owned.sum()) <= MOST_CELLS:
+                features.own(owned)
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`."""
         grid = self.grid
         assert grid is not None, "settle comes first"
-        side = float(grid.side)
-        step = self.config.step_cells * side
+        step = self.config.step_cells * float(grid.side)
         jitter = self.uniform(len(rays), 1) if self.training else None
         samples = grid.march(rays, step, jitter, (self.config.near, self.config.far))
         positions = samples.positions
-        features = positions[:, :0] if self.features is None else self.features(positions)
+        features = positions[:, :0] if self.features is None else self.features(positions, samples.cell)
         centered = (positions - grid.middle) / grid.reach
         raw, color = self.fine(centered, features, rays.directions, samples.first, samples.ray)
-        density = torch.exp(raw.clamp(max=LARGEST)) / side
-        if self.training and self._learns_cells:
+        density = torch.exp(raw.clamp(max=LARGEST)) / float(grid.first_side)
+        if self.training and self.config.learns_cells:
             grid.remember(samples, density)
         rgb, accumulation = render_packed(density, color, step, samples.first, samples.ray)
         background = self.behind(rays)

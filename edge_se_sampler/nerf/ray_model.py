@@ -74,15 +74,19 @@ class RayModel(nn.Module, ABC):
             InputError: it is another model's, or the model is settled in other cells: features would lie at other
                 corners.
         """
-        if "grid.possible" in state_dict:
-            told = {key: state_dict[f"grid.{key}"] for key in ("corner", "side", "possible")}
+        if "grid.splits" in state_dict:
+            told = {key.removeprefix("grid."): told for key, told in state_dict.items() if key.startswith("grid.")}
+            first, splits = OccupancyGrid.at_first(told)
             if self.grid is None:
-                self.settle(OccupancyGrid(told["corner"], float(told["side"]), told["possible"]))
-            elif any(not torch.equal(cells.cpu(), getattr(self.grid, key).cpu()) for key, cells in told.items()):
+                self.settle(first)
+            elif not first.is_the_same_as(self.grid):
                 raise InputError(
                     "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
                     "this machine rounds otherwise; resume with what it began with, or train anew"
                 )
+            assert self.grid is not None
+            for _ in range(splits):
+                self.grid.split()
         try:
             return super().load_state_dict(state_dict, *args, **kwargs)
         except RuntimeError as problem:
