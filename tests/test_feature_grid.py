@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
+import torch.nn.functional as F
 
 from edge_se_sampler.nerf.feature_grid import FeatureGrid
 from edge_se_sampler.nerf.hull import Hull
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.occupancy import OccupancyGrid, halved
 
 SIDE = 0.5
 
@@ -81,9 +83,86 @@ def test_features_do_not_jump_between_cells() -> None:
         features.table.copy_(torch.randn(features.table.shape, generator=torch.Generator().manual_seed(0)))
     face = torch.tensor([[-0.5, 0.8, 2.7], [0.0, 1.3, 3.1]], dtype=torch.float64)
     step = torch.tensor([1e-9, 0, 0], dtype=torch.float64)
-    torch.testing.assert_close(features_at(features, face - step), features_at(features, face + step), rtol=0, atol=1e-6)
+    one, other = (features_at(features, face + sign * step) for sign in (-1, 1))
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
 
 
 def test_features_begin_at_nothing() -> None:
     shown = some_cells()
     assert not bool(features_at(FeatureGrid(grid(shown), 4).double(), inside(shown)).any())
+
+
+# -- cells that are split
+
+
+def random_features(cells: OccupancyGrid) -> FeatureGrid:
+    features = FeatureGrid(cells, 3).double()
+    with torch.no_grad():
+        features.table.normal_(generator=torch.Generator().manual_seed(0))
+    return features
+
+
+def split_some(shown: np.ndarray, splits: int = 1) -> tuple[FeatureGrid, torch.Tensor]:
+    """Cells of which about half are split so often, and which of today's were."""
+    cells = OccupancyGrid.of(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown), splits).double()
+    features = random_features(cells)
+    owned = cells.possible & (torch.rand(cells.possible.shape, generator=torch.Generator().manual_seed(1)) < 0.5)
+    for _ in range(splits):
+        owned = halved(owned)
+        features.own(owned)
+    return features, owned
+
+
+@pytest.mark.parametrize("splits", [1, 2])
+def test_a_split_changes_no_feature(splits: int) -> None:
+    shown, points = some_cells(), inside(some_cells())
+    features, owned = split_some(shown, splits)
+    before = random_features(grid(shown))
+    (cells,) = features.grid
+    assert float(cells.side) == SIDE / 2**splits
+    assert 0.2 < owned.reshape(-1)[cells.locate(points)].double().mean() < 0.8
+    torch.testing.assert_close(features_at(features, points), features_at(before, points))
+
+
+def test_split_cells_have_corners_of_their_own_and_others_the_first_ones() -> None:
+    features, owned = split_some(some_cells())
+    before, points = random_features(grid(some_cells())), inside(some_cells())
+    (cells,) = features.grid
+    inner = owned.reshape(-1)[cells.locate(points)]
+    with torch.no_grad():
+        features.table[len(before.table) :] += 1
+    after = features_at(features, points) - features_at(before, points)
+    torch.testing.assert_close(after[inner], torch.ones_like(after[inner]))
+    torch.testing.assert_close(after[~inner], torch.zeros_like(after[~inner]))
+    with torch.no_grad():
+        features.table[: len(before.table)] += 2
+    after = features_at(features, points) - features_at(before, points)
+    torch.testing.assert_close(after[~inner], torch.full_like(after[~inner], 2))
+
+
+def test_corners_of_split_cells_are_stored_once() -> None:
+    one = np.zeros((3, 1, 1), dtype=bool)
+    one[1] = True
+    features, _ = split_some(one, 0)
+    (cells,) = features.grid
+    assert len(features.table) == 8
+    cells.splits[1] = 1
+    features.own(halved(cells.possible))
+    assert len(features.table) == 8 + 27
+
+
+def test_cells_that_join_later_begin_with_what_is_known_there() -> None:
+    features, owned = split_some(some_cells())
+    with torch.no_grad():  # the levels have gone apart
+        features.table.normal_(generator=torch.Generator().manual_seed(2))
+    (cells,) = features.grid
+    points = inside(some_cells())
+    apart = ~F.max_pool3d(owned.double()[None, None], 3, 1, 1)[0, 0].bool().reshape(-1)[cells.locate(points)]
+    inner = owned.reshape(-1)[cells.locate(points)]
+    before, rows = features_at(features, points), len(features.table)
+    features.own(cells.possible.clone())
+    assert len(features.table) > rows
+    assert int(apart.sum()) > 5
+    after = features_at(features, points)
+    torch.testing.assert_close(after[apart], before[apart])
+    torch.testing.assert_close(after[inner], before[inner])

@@ -138,3 +138,20 @@ def test_the_largest_density_of_a_cell_counts() -> None:
     expected = np.zeros(grid.possible.numel())
     np.maximum.at(expected, samples.cell.numpy(), density.numpy())
     np.testing.assert_array_equal(grid.largest.reshape(-1).numpy(), expected)
+
+
+def test_a_split_moves_nothing() -> None:
+    shown, points = cells(), torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (5000, 3)))
+    grid, whole = OccupancyGrid.of(Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown), 2).double(), grid_of(shown)
+    for done in (1, 2):
+        grid.split()
+        assert torch.equal(grid.contains(points), whole.contains(points))
+        sides = (float(grid.first_side), float(grid.side), float(grid.finest_side))
+        assert sides == (SIDE, SIDE / 2**done, SIDE / 4)
+        torch.testing.assert_close(grid.middle, whole.middle)
+        assert float(grid.reach) == float(whole.reach)
+        assert torch.equal(grid.possible_at_first, whole.possible)
+    first, splits = OccupancyGrid.at_first(grid.state_dict())
+    assert splits == 2
+    assert not first.is_the_same_as(whole.float())  # may be split, that one not
+    assert first.is_the_same_as(OccupancyGrid.of(Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown), 2))

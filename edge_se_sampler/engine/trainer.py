@@ -132,8 +132,9 @@ class Trainer:
             for level, sub_seed in self.revival.after_backward().items():
                 print(f"step {step}: the {level} network is dead and begins anew, sub-seed {sub_seed}", file=sys.stderr)
                 self._record(step, revived=level, sub_seed=sub_seed)
-        for state in [state for weight, state in self.optimizer.state.items() if state["exp_avg"].shape != weight.shape]:
-            state.clear()  # a table of features has got another size: its averages begin anew
+        for weight, state in self.optimizer.state.items():
+            if state["exp_avg"].shape != weight.shape:  # a table of features that has got more rows, or fewer
+                state.clear()
         self.optimizer.step()
         self.pipeline.datamanager.observe(torch.cat(errors))
         for callback in self.callbacks:

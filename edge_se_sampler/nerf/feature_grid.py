@@ -56,7 +56,10 @@ class FeatureGrid(nn.Module):
         sides = (grid.first_side, grid.side * len(grid.possible) / len(owned))
         shown = zip((grid.possible_at_first, owned), sides, strict=True)
         where = torch.cat([grid.corner + torch.nonzero(_corners(cells)) * side for cells, side in shown])
-        known = self(where, grid.locate(where))
+        around = where[:, None] + (torch.tensor(_CORNERS, device=where.device) - 0.5) * (sides[1] / 2)
+        cell = grid.locate(around.reshape(-1, 3)).reshape(-1, 8)
+        finest = self.owned.reshape(-1)[cell].int().argmax(dim=1, keepdim=True)  # a corner is its finest cell's
+        known = self(where, cell.gather(1, finest)[:, 0])
         if len(owned) > len(grid.possible):
             grid.split()
         self.owned = owned

@@ -19,7 +19,7 @@ from edge_se_sampler.nerf.config import LeanModelConfig
 from edge_se_sampler.nerf.encoding import encoded_size, positional_encoding
 from edge_se_sampler.nerf.feature_grid import FeatureGrid
 from edge_se_sampler.nerf.field import initialize_all, linear
-from edge_se_sampler.nerf.occupancy import MOST_CELLS, OccupancyGrid, halved
+from edge_se_sampler.nerf.occupancy import MOST_CELLS, OccupancyGrid, halved, with_neighbours
 from edge_se_sampler.nerf.packed import render_packed, spread, sum_rays, transmittance
 from edge_se_sampler.nerf.ray_model import RayModel
 
@@ -38,13 +38,12 @@ the first does not count: densities mean nothing yet."""
 LEAST_OPACITY = 0.01
 """Of the smallest cell that there may be: below, it is taken to be empty."""
 SOLID = 0.5
-"""Optical depth of a cell: as long as none in a box of which nothing was known has it, nothing is learnt, and nothing
-judged."""
+"""Optical depth of a cell that holds something, rather than haze. As long as there is none in a box of which nothing
+was known, nothing is learnt, and nothing judged."""
 TRIED_AGAIN = 0.02
 """Share of the empty cells that are tried again until the next judgement."""
-MISJUDGED = 0.05
-"""Cells that turn out to be dense beside those that were split, as a share of them, from which on they get corners of
-their own, too."""
+MISJUDGED = 0.01
+"""Solid cells beside those that were split, as a share of all, from which on they get corners of their own, too."""
 
 
 class LeanField(nn.Module):
@@ -147,26 +146,28 @@ class LeanModel(RayModel):
         every = JUDGE_EVERY // 2 if large else JUDGE_EVERY
         if step < every or step % every:
             return
-        if step == every or (large and float(grid.largest.max() * grid.side) < SOLID):
+        solid = grid.largest * grid.side > SOLID
+        if step == every or (large and not solid.any()):
             grid.largest.zero_()
             return
         share = TRIED_AGAIN / 2 ** int(grid.splits[0])
         again = torch.rand(grid.possible.shape, generator=self.random, device=self.device) < share
-        self._refine(grid, grid.judge(-math.log1p(-LEAST_OPACITY) / float(grid.finest_side), again))
+        kept = grid.judge(-math.log1p(-LEAST_OPACITY) / float(grid.finest_side), again)
+        self._refine(grid, kept, solid)
 
-    def _refine(self, grid: OccupancyGrid, kept: Tensor) -> None:
-        """Split the cells that are kept, once they are few enough; see to those that were left out by mistake.
+    def _refine(self, grid: OccupancyGrid, kept: Tensor, solid: Tensor) -> None:
+        """Split the cells that are kept, once they are few enough; later, see to those left out by mistake.
 
         Args:
-            kept: (X, Y, Z) bool.
+            kept, solid: (X, Y, Z) bool.
         """
         features = self.features
         if grid.splits[1] and 8 * int(kept.sum()) <= MOST_CELLS:
             grid.split() if features is None else features.own(halved(kept))
         elif features is not None and grid.splits[0]:
-            owned = features.owned | kept
-            more = int((owned ^ features.owned).sum())
-            if more > MISJUDGED * int(features.owned.sum()) and int(owned.sum()) <= MOST_CELLS:
+            missed = solid & ~features.owned
+            owned = features.owned | (with_neighbours(missed) & grid.possible)
+            if missed.sum() > MISJUDGED * solid.sum() and owned.sum() <= MOST_CELLS:
                 features.own(owned)
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:

@@ -187,12 +187,17 @@ class OccupancyGrid(nn.Module):
         Returns:
             (X, Y, Z) bool: the cells that are not occupied for a trial alone.
         """
-        near = self.largest > empty
-        for axis in range(3):  # nothing comes back on the other side: the rim is empty
-            near = near | near.roll(1, axis) | near.roll(-1, axis)
+        near = with_neighbours(self.largest > empty)
         self.occupied.copy_((near | again) & self.possible)
         self.largest.zero_()
         return near & self.possible
+
+
+def with_neighbours(cells: Tensor) -> Tensor:
+    """Cells (X, Y, Z) bool, and the 26 around each; none of them in the outermost."""
+    for axis in range(3):
+        cells = cells | cells.roll(1, axis) | cells.roll(-1, axis)
+    return cells
 
 
 def halved(cells: Tensor) -> Tensor:
