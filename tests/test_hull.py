@@ -18,8 +18,8 @@ from edge_se_sampler.data.made.cameras import poses
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerf import economy
 from edge_se_sampler.nerf import hull as hull_module
-from edge_se_sampler.nerf.config import LeanModelConfig
-from edge_se_sampler.nerf.economy import MOST_CELLS, live_pixels, needs, spread_pixels
+from edge_se_sampler.nerf.config import LeanModelConfig, NeRFModelConfig
+from edge_se_sampler.nerf.economy import MOST_PLACES, live_pixels, needs, spread_pixels
 from edge_se_sampler.nerf.hull import (
     AHEAD,
     AROUND,
@@ -32,7 +32,7 @@ from edge_se_sampler.nerf.hull import (
     projected,
     silhouettes,
 )  # fmt: skip
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.occupancy import MOST_CELLS, OccupancyGrid
 
 VIEWS = 12
 
@@ -319,6 +319,24 @@ def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None
     many = needs(views_of(rods(), 800, 4), LeanModelConfig(cell_pixels=0.2))
     assert many.hull.side > 0.2 * many.footprint
     assert 0.05 * MOST_CELLS < many.hull.cells.sum() < MOST_CELLS
+
+
+@pytest.mark.parametrize(("size", "splits"), [(100, 2), (800, 2), (20, 0)])
+def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int, splits: int) -> None:
+    views = views_of(rods(), size, 4)
+    told = needs(views, LeanModelConfig(cull_by_alpha=False))
+    assert told.splits == splits
+    assert told.hull.cells.sum() <= 1.3 * MOST_CELLS / 8
+    assert told.hull.cells.size * 8**told.splits < MOST_PLACES
+    if size == 100:  # as near as halving comes to what a pixel asks
+        assert 2**-0.5 < told.hull.side / 2**splits / told.footprint < 2**0.5
+    for settled in (
+        needs(views, LeanModelConfig()),
+        needs(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
+        needs(views, LeanModelConfig(economy="off")),
+        needs(views, NeRFModelConfig(economy="auto")),
+    ):
+        assert settled.splits == 0
 
 
 # -- live pixels

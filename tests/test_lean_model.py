@@ -225,15 +225,23 @@ def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_other
         torch.testing.assert_close(value, before[key], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("reason", ["nothing is solid", "too many", "no splits left", "not the time"])
-def test_cells_stay_large(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("reason", ["nothing is solid", "no splits left", "not the time"])
+def test_cells_stay_large(reason: str) -> None:
     model = open_model(0 if reason == "no splits left" else 1)
     seen(model, 0.9 * SOLID / SIDE if reason == "nothing is solid" else 100.0)
-    monkeypatch.setattr(lean, "MOST_CELLS", 8 * 26 if reason == "too many" else 8 * 27)
     before = int(cells(model).occupied.sum())
-    after = judged(model, 3 * EARLY + 1 if reason == "not the time" else 2 * EARLY)
-    assert cells(model).splits.tolist()[0] == 0
-    assert (after == before) == (reason in ("nothing is solid", "not the time", "no splits left"))
+    assert judged(model, 3 * EARLY + 1 if reason == "not the time" else 2 * EARLY) == before
+    assert cells(model).splits[0] == 0
+
+
+@pytest.mark.parametrize("room", [6**3, 6**3 - 1])
+def test_cells_are_split_again_once_they_are_few_enough(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lean, "MOST_CELLS", room)
+    model = open_model(2)
+    for step in (2, 3):
+        seen(model, 100.0)
+        judged(model, step * EARLY)
+    assert cells(model).splits.tolist() == ([2, 0] if room == 6**3 else [1, 1])
 
 
 def test_what_was_left_out_by_mistake_is_tried_again_found_and_split() -> None:
@@ -432,5 +440,8 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     assert said["sampling"].startswith("uniform")
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
+    large = needs(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
+    assert f"split to {large.hull.side / 2:.4f} where training finds something" in unlocated
+    assert "split" not in said["cells"]
     for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf"), ("--step-cells", "1e-5")):
         assert edge_se("inspect", "--data", larger, flag, value).code == 2

@@ -57,7 +57,8 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
         "box": f"{2 * box.half:.2f} a side: as deep as rays are sampled",
         "silhouettes": f"{told.silhouettes} of {len(views.images)} views tell the object from its background by alpha",
         "cells": f"{hull.side:.4f} a side, {hull.side / told.footprint:.1f} pixels; {hull.cells.sum():,} of "
-        f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)",
+        f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)"
+        + (f", split to {hull.side / 2**told.splits:.4f} where training finds something" if told.splits else ""),
         "rays": f"{100 * across:.1f} % of the pixels may cross them; such a ray has {samples:.1f} samples, {along:.0f} "
         "along all of its depth",
         "sampling": "uniform among them"

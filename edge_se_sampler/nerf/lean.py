@@ -156,15 +156,17 @@ class LeanModel(RayModel):
         self._refine(grid, kept, solid)
 
     def _refine(self, grid: OccupancyGrid, kept: Tensor, solid: Tensor) -> None:
-        """Split the cells that are kept, once they are few enough; later, see to those left out by mistake.
+        """Split the cells that are kept, at first and then once they are few enough; later, see to those left out by
+        mistake.
 
         Args:
             kept, solid: (X, Y, Z) bool.
         """
         features = self.features
-        if grid.splits[1] and 8 * int(kept.sum()) <= MOST_CELLS:
+        done, left = grid.splits.tolist()
+        if left and (done == 0 or 8 * kept.sum() <= MOST_CELLS):
             grid.split() if features is None else features.own(halved(kept))
-        elif features is not None and grid.splits[0]:
+        elif features is not None and done:
             missed = solid & ~features.owned
             owned = features.owned | (with_neighbours(missed) & grid.possible)
             if missed.sum() > MISJUDGED * solid.sum() and owned.sum() <= MOST_CELLS:
