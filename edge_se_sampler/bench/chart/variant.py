@@ -48,7 +48,8 @@ VARIANTS: dict[str, Variant] = {
     "edge-se-auto": Variant("scorings", "Edge + SE, auto", "edge-se-nerf", {f"{SAMPLER}.schedule": "auto"}),
     "lean-se": Variant("sampling", "squared errors remembered", changes=REMEMBERED),
     "lean-se-weighted": Variant(  # Soft Mining's rule (Kheradmand et al. 2024), its exponent; its Langevin moves aside
-        "sampling", "squared errors remembered, loss weighted", changes=REMEMBERED | {f"{SAMPLER}.importance_weight": 0.6}
+        "sampling", "squared errors remembered, loss weighted",
+        changes=REMEMBERED | {f"{SAMPLER}.importance_weight": 0.6},
     ),
     "lean-edge": Variant("sampling", "Edge first", changes={f"{SAMPLER}.early": "edge"}),
     "lean-edge-se": Variant(
