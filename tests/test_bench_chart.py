@@ -20,7 +20,9 @@ from edge_se_sampler.bench.chart.summary import (
     dominating,
     front,
     over_scenes,
+    rows_of,
     rows_of_others,
+    rows_of_scenes,
     table,
 )
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
@@ -167,6 +169,23 @@ def test_the_table_counts_failures() -> None:
     line = next(line for line in table(runs, []).splitlines() if line.startswith("| Random"))
     assert line.split(" | ")[3:5] == ["16.00", "2 of 3"]
     assert "100.0 | 100 | 1 MiB |" in line
+
+
+def test_methods_are_tabled_where_what_scores_them_was_trained_and_scene_by_scene() -> None:
+    runs = [run_of("edge-se-coarse", "mic", 0, [(1, 12)]), run_of("edge", "mic", 1, [(1, 30)])]
+    for k, scene in enumerate(("chair", "mic")):
+        runs += [
+            run_of("lean", scene, 0, [(1, 20 + k)]),
+            run_of("edge", scene, 0, [(1, 10 + k)], ("background", "learnt")[k]),
+        ]
+    _, rows = rows_of(runs)
+    assert {row[0]: row[1] for row in rows["methods"]} == {"lean-nerf": "21.00", "Edge": "11.00"}
+    assert {row[0]: row[1] for row in rows["scorings"]} == {"lean-nerf": "21.00", "Edge + SE, coarse": "12.00"}
+    assert rows_of_scenes(runs) == (
+        ["", "chair", "mic"], [["lean-nerf", "20.00", "21.00"], ["Edge", "(10.00)", "11.00"]],
+    )  # fmt: skip
+    assert "| Edge | (10.00) | 11.00 |" in table(runs, [])
+    assert "Every scene" not in table([run for run in runs if run["scene"] == "mic"], [])
 
 
 def test_other_programs_are_shown_at_the_same_looks() -> None:

@@ -8,13 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.chart.summary import RECOMMENDED, Run, beside, comparable, front, over_scenes, scenes_of
+from edge_se_sampler.bench.chart.summary import (
+    RECOMMENDED,
+    TOP,
+    Run,
+    beside,
+    comparable,
+    front,
+    over_scenes,
+    scenes_of,
+)
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
 from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
 from edge_se_sampler.show import require_pyplot
 
-TOP: tuple[Group, ...] = ("methods", "scorings")
-"""Kinds of variants on the chart itself; the others are parts of the recommended method."""
 MIB = 2**20
 
 

@@ -17,6 +17,8 @@ from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
 
 Run = dict[str, Any]
 RECOMMENDED = "lean"
+TOP: tuple[Group, ...] = ("methods", "scorings")
+"""Kinds of variants on the chart itself; the others are parts of the recommended method."""
 
 
 def scenes_of(runs: list[Run]) -> list[str]:
@@ -87,10 +89,21 @@ def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     head = ["", *(f"{look} s" for look in looks), "end", "failed", "ms a step", "evaluations a step", "memory"]
     told: dict[Group, list[list[str]]] = {}
     for group in GROUPS:
-        mine = comparable(runs, (group,))
+        mine = comparable(runs, TOP if group in TOP else (group,))
         if any(VARIANTS[name].group == group for name in mine):
-            told[group] = [[VARIANTS[name].label, *_fields(rows, looks)] for name, rows in mine.items()]
+            shown = [name for name in mine if VARIANTS[name].group == group or name == RECOMMENDED]
+            told[group] = [[VARIANTS[name].label, *_fields(mine[name], looks)] for name in shown]
     return head, told
+
+
+def rows_of_scenes(runs: list[Run]) -> tuple[list[str], list[list[str]]]:
+    """Of the variants that were trained on all scenes with one seed, the least: PSNR at the end on each, in brackets
+    where nothing was learnt. No rows where there is one scene."""
+    scenes, seed = scenes_of(runs), min(run["seed"] for run in runs)
+    ends = {(run["variant"], run["scene"]): run for run in runs if run["seed"] == seed}
+    names = [name for name in VARIANTS if all((name, scene) in ends for scene in scenes)]
+    told = [[VARIANTS[name].label, *(_end(ends[name, scene]) for scene in scenes)] for name in names]
+    return ["", *scenes], told if len(scenes) > 1 else []
 
 
 def beside(program: dict[str, Any], shown: dict[str, list[Run]]) -> list[Run]:
@@ -102,7 +115,7 @@ def beside(program: dict[str, Any], shown: dict[str, list[Run]]) -> list[Run]:
 
 def rows_of_others(runs: list[Run], external: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Of every other program its name, version, flags, and PSNR at the same looks and at the end."""
-    shown = comparable(runs, ("methods",))
+    shown = comparable(runs, TOP)
     told = []
     for program in external:
         mine = beside(program, shown)
@@ -115,6 +128,9 @@ def table(runs: list[Run], external: Sequence[dict[str, Any]]) -> str:
     """Markdown of both."""
     head, rows = rows_of(runs)
     tables = {GROUPS[group]: (head, mine) for group, mine in rows.items()}
+    scenes, ends = rows_of_scenes(runs)
+    if ends:
+        tables["Every scene, one seed, at the end"] = (scenes, ends)
     if external:
         looks = head[1 : head.index("failed")]
         tables["Other programs"] = (["", "version", "flags", *looks], rows_of_others(runs, external))
@@ -131,6 +147,10 @@ def table(runs: list[Run], external: Sequence[dict[str, Any]]) -> str:
 
 def _shown_looks(runs: list[Run]) -> list[int]:
     return [look for look in (3, 7, 20, 60) if any(run["seconds"] > 1.05 * look for run in runs)]
+
+
+def _end(run: Run) -> str:
+    return f"{run['psnr']:.2f}" if run["outcome"] == "learnt" else f"({run['psnr']:.2f})"
 
 
 def _shown(psnr: float | None) -> str:
