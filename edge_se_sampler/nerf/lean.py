@@ -41,7 +41,8 @@ SOLID = 0.5
 """Optical depth of a cell that holds something, rather than haze. As long as there is none in a box of which nothing
 was known, nothing is learnt, and nothing judged."""
 TRIED_AGAIN = 0.02
-"""Share of the empty cells that are tried again until the next judgement."""
+"""Share of the empty cells that are tried again until the next judgement; half of it after each split, for there are
+eight times as many, and one of them is enough to find what was missed."""
 MISJUDGED = 0.01
 """Solid cells beside those that were split, as a share of all, from which on they get corners of their own, too."""
 
