@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.bench import demo
-from edge_se_sampler.bench.chart.summary import dominating, front, over_scenes, rows_of, rows_of_others
+from edge_se_sampler.bench.chart.summary import dominating, front, over_scenes, rows_of, rows_of_others, rows_of_scenes
 from edge_se_sampler.bench.chart.variant import VARIANTS
 from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, Cell, run_cell
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
@@ -211,6 +211,34 @@ def test_the_readme_quotes_the_chart():
         f"Without the hull drums ends at {end['no-hull', 'drums']} dB and mic at {end['no-hull', 'mic']}, seed 0; with "
         f"it at {end['lean', 'drums']} and {end['lean', 'mic']}."
     ) in " ".join((ROOT / "README.md").read_text().split())
+    _, scenes = rows_of_scenes(told["runs"])
+    assert all(in_readme(row) for row in scenes)
+    dead = {row[0]: sum(end.startswith("(") for end in row[1:]) for row in scenes}
+    assert {name for name, count in dead.items() if count} == {"Random", "SE"}
+    assert dead["Random"] == dead["SE"] == 6
+
+
+def test_the_readme_says_what_edges_and_split_cells_are_worth_without_a_hull():
+    runs = result("chart/result.json")["runs"]
+
+    def ended(name: str, scene: str, seconds: float = float("inf")) -> float:
+        mine = [run for run in runs if (run["variant"], run["scene"]) == (name, scene)]
+        return over_scenes(mine, seconds) or float("nan")
+
+    def ahead(*where: Any) -> float:
+        return ended("no-hull", *where) - ended("no-hull-uniform", *where)
+
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert (
+        f"ahead at first, by {ahead('bricks', 3):.1f} dB after 3 s on bricks and {ahead('mic', 7):.1f} after 7 s on "
+        f"mic, and behind after the minute, by {-ahead('bricks'):.1f} and {-ahead('mic'):.1f} dB (on drums it is "
+        f"{ahead('drums'):.1f} ahead to the end)"
+    ) in text
+    assert f"worth {ended('no-hull', 'bricks') - ended('economy-off', 'bricks'):.1f} dB" in text
+
+
+def test_every_method_is_on_the_chart_with_three_seeds():
+    told = result("chart/result.json")
     for name, variant in VARIANTS.items():
         if variant.group in ("methods", "scorings"):
             runs = [run for run in told["runs"] if (run["variant"], run["scene"]) == (name, "bricks")]

@@ -114,11 +114,15 @@ def draw_scenes(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scal
                     axis.plot(x[-1], y[-1], "x", color=color, ms=6)
         for program in external:
             for run in (run for run in program["runs"] if run["scene"] == scene):
-                axis.plot([p[0] for p in run["curve"]], [p[-1] for p in run["curve"]], "k:", lw=1)
+                label = None if "others" in labelled else "other programs"
+                labelled.add("others")
+                axis.plot([p[0] for p in run["curve"]], [p[-1] for p in run["curve"]], "k:", lw=1, label=label)
         axis.set_title(scene)
         _finish(axis, "")
     for axis in axes.ravel()[len(names) :]:
         axis.set_visible(False)
+    for axis in axes.ravel()[len(names) - columns : len(names)]:
+        axis.tick_params(labelbottom=True)  # also above a place left empty
     figure.legend(loc="lower center", ncols=4, fontsize=8, frameon=False)
     figure.supylabel("test PSNR [dB]", fontsize=9)
     figure.supxlabel(seconds_of(scale), fontsize=9, y=0.1)
