@@ -443,5 +443,7 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     large = needs(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
     assert f"split to {large.hull.side / 2:.4f} where training finds something" in unlocated
     assert "split" not in said["cells"]
+    whole = large.hull.cells
+    assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
     for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf"), ("--step-cells", "1e-5")):
         assert edge_se("inspect", "--data", larger, flag, value).code == 2

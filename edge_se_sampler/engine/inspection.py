@@ -45,7 +45,7 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
     """One a finding: the quantity, its value, and where it comes from."""
     hull, box = told.hull, told.box
     sizes = sorted({image.shape[1::-1] for image in views.images})
-    whole = (2 * box.half / hull.side) ** 3
+    whole = max(hull.cells.size, (2 * box.half / hull.side) ** 3)  # large cells may reach beyond the box
     samples, along = _samples(views, told, live, config)
     distance = np.linalg.norm(views.camera_to_worlds[:, :, 3] - box.middle, axis=1)
     at = ", ".join(f"{value + 0.0:.2f}" for value in box.middle.round(2))
