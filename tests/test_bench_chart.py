@@ -254,6 +254,10 @@ def test_curves_of_a_single_look_are_drawn() -> None:
     np.testing.assert_array_equal(drawn[0].get_xydata(), [[3, 21.5]])
     labels = [text.get_text() for text in draw_scenes(runs, [], Scale(seconds=2)).legends[0].get_texts()]
     assert sorted(labels) == ["Edge", "lean-nerf"]  # once each, whatever the seeds
+    parts = [run_of("no-hull", "mic", 0, [(1, 20)], "background"), run_of("rays-128", "chair", 0, [(1, 22)])]
+    mic, chair = draw_scenes([*parts], [], Scale(seconds=2)).axes[1::-1]
+    assert [line.get_marker() for line in mic.lines] == ["None", "x"]
+    assert [len(axis.lines) for axis in (mic, chair)] == [2, 1]  # no method is among them
 
 
 # -- the command

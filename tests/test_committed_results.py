@@ -218,6 +218,17 @@ def test_the_readme_quotes_the_chart():
     assert dead["Random"] == dead["SE"] == 6
 
 
+def test_the_readme_quotes_lean_nerf_without_alpha_on_every_scene():
+    runs = result("lean-no-hull/result.json")["runs"]
+    assert {run["variant"] for run in runs} == {"no-hull"}
+    assert {(run["scene"], run["seed"]) for run in runs} == set(product(SCENES, range(10)))
+    psnrs = [run["psnr"] for run in runs]
+    assert (
+        f"of {len(runs)} such trainings {sum(run['outcome'] != 'learnt' for run in runs)} failed, with "
+        f"{statistics.mean(psnrs):.2f} dB on average and {min(psnrs):.2f} at least."
+    ) in " ".join((ROOT / "README.md").read_text().split())
+
+
 def test_the_readme_says_what_edges_and_split_cells_are_worth_without_a_hull():
     runs = result("chart/result.json")["runs"]
 

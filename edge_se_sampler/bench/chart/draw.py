@@ -94,14 +94,15 @@ def draw_costs(runs: list[Run]) -> Any:
 
 
 def draw_scenes(runs: list[Run], external: Sequence[dict[str, Any]], scale: Scale) -> Any:
-    """Methods, a panel a scene, every seed a line; failed ones end in a cross."""
+    """Methods, or what there is if there are none: a panel a scene, every seed a line; failed ones end in a cross."""
     names = scenes_of(runs)
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
     figure, axes = require_pyplot().subplots(
         rows, columns, figsize=(3.1 * columns, 2.7 * rows), squeeze=False, sharex=True, sharey=True
     )
-    shown = {name: v for name, v in VARIANTS.items() if v.group == "methods"}
+    trained = {name: v for name, v in VARIANTS.items() if any(run["variant"] == name for run in runs)}
+    shown = {name: v for name, v in trained.items() if v.group == "methods"} or trained
     labelled: set[str] = set()
     for axis, scene in zip(axes.ravel(), names, strict=False):
         for name, (color, style) in _looks_of(shown).items():
