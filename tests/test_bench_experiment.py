@@ -40,6 +40,7 @@ def interrupts_and_works_on(cell, *_):
     time.sleep(60)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, where a shell began the tests with &
     path = pathlib.Path("result.json")
     todo = [Cell("lean", "mic", seed) for seed in range(3)]
     run_cells(todo, begun(path, Scale()), path, executor_of(1, None), interrupts_and_works_on, lambda _: ())
