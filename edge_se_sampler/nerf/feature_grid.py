@@ -33,11 +33,11 @@ class FeatureGrid(nn.Module):
     """Row of each corner in the table, the first level's (X + 1) (Y + 1) (Z + 1) and then the second's; that of no
     cell's: any."""
     start: Tensor
-    """(2,) int64: where each level begins in `place`."""
+    """(1|2,) int64: where each level begins in `place`; one, as long as nothing is split."""
     stride: Tensor
-    """(2, 3) int64: how much farther in `place` the next corner is, along each axis."""
+    """(1|2, 3) int64: how much farther in `place` the next corner is, along each axis."""
     offsets: Tensor
-    """(2, 8) int64: the same for each corner of a cell."""
+    """(1|2, 8) int64: the same for each corner of a cell."""
 
     def __init__(self, grid: OccupancyGrid, size: int) -> None:
         super().__init__()
@@ -69,7 +69,8 @@ class FeatureGrid(nn.Module):
     def forward(self, positions: Tensor, cell: Tensor) -> Tensor:
         """(m, 3) world units and (m,) int64 numbers of their cells, possible ones -> (m, F)."""
         (grid,) = self.grid
-        level = self.owned.reshape(-1)[cell].long()
+        split = len(self.start) > 1  # if not, one level for all, rather than one for each
+        level = self.owned.reshape(-1)[cell].long() if split else self.start.new_zeros(1)
         at = (positions - grid.corner) / torch.stack((grid.first_side, grid.side))[level][:, None]
         low = at.floor()
         share = at - low
@@ -84,9 +85,9 @@ class FeatureGrid(nn.Module):
         (grid,) = self.grid
         places, starts, strides, rows, size = [], [], [], 0, 0
         for cells in (grid.possible_at_first, self.owned):
+            if places and not cells.any():  # nothing is split: one level
+                continue
             corners = _corners(cells)
-            if places and not cells.any():  # nothing was split: spare the memory
-                corners = corners[:0]
             _, wide, deep = corners.shape
             starts.append(size)
             strides.append((wide * deep, deep, 1))
