@@ -55,7 +55,7 @@ def draw_parts(runs: list[Run], scale: Scale) -> Any:
     trained = {VARIANTS[run["variant"]].group for run in runs}
     groups: list[Group] = [group for group in GROUPS if group not in TOP and group in trained]
     figure, axes = require_pyplot().subplots(
-        1, max(1, len(groups)), figsize=(4.4 * max(1, len(groups)), 5.2), sharey=True, squeeze=False
+        1, max(1, len(groups)), figsize=(4.4 * max(1, len(groups)), 6.4), sharey=True, squeeze=False
     )
     axes = axes[0]
     for axis, group in zip(axes, groups, strict=False):
@@ -65,7 +65,7 @@ def draw_parts(runs: list[Run], scale: Scale) -> Any:
             _draw_curve(axis, mine, VARIANTS[name].label, color, "-" if i < 11 else "--", strong)
         axis.set_title(GROUPS[group])
         _finish(axis, seconds_of(scale))
-        axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
+        axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14))
     axes[0].set_ylabel("test PSNR [dB]")
     figure.tight_layout()
     return figure
