@@ -1,4 +1,4 @@
-"""A tiny NeRF, rays through its sampled shell, views of random pixels, and a tiny training's flags."""
+"""A tiny NeRF, a model's cells, rays through its sampled shell, views of random pixels, and a tiny training's flags."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.nerf.config import NeRFModelConfig
 from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.ray_model import RayModel
 
 SMALL = (
     "--max-num-iterations", "6", "--pipeline.datamanager.train-num-rays-per-batch", "16",
@@ -41,6 +43,18 @@ def tiny_config(**changes: Any) -> NeRFModelConfig:
 def tiny_model(seed: int = 0, **changes: Any) -> NeRFModel:
     """It, in float64."""
     return NeRFModel(tiny_config(**changes), np.random.default_rng(seed)).double()
+
+
+def cells(model: RayModel) -> OccupancyGrid:
+    """Where a settled model is asked."""
+    assert model.grid is not None
+    return model.grid
+
+
+def judged(model: RayModel, step: int) -> int:
+    """How many cells are occupied when a step has begun."""
+    model.begin_step(step, step + 1)
+    return int(cells(model).occupied.sum())
 
 
 def tiny_rays(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> RayBundle:

@@ -1,0 +1,115 @@
+"""Cells that begin large and are split where training finds something: when, where, and what becomes of the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import cells, judged, tiny_rays
+from torch import Tensor
+
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.nerf import lean
+from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.hull import Hull
+from edge_se_sampler.nerf.lean import JUDGE_EVERY, SOLID, LeanModel
+from edge_se_sampler.nerf.occupancy import OccupancyGrid
+
+RAYS = 12
+SIDE = 0.3
+EARLY = JUDGE_EVERY // 2
+
+
+def open_model(splits: int = 1, **changes: Any) -> LeanModel:
+    """In a cube of which nothing is known."""
+    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, features=3), **changes)
+    model = LeanModel(config, np.random.default_rng(0))
+    model.settle(OccupancyGrid.of(Hull(np.full(3, -1.2), SIDE, np.ones((8, 8, 8), dtype=bool)), splits))
+    return model.double().train()
+
+
+def seen(model: LeanModel, density: float) -> Tensor:
+    """A cell in the middle in which training has seen a density, and none elsewhere: its place, (3,)."""
+    where = torch.tensor(cells(model).possible.shape) // 2
+    cells(model).largest.zero_()
+    cells(model).largest[tuple(where)] = density
+    return where
+
+
+def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_otherwise() -> None:
+    model = open_model(step_cells=0.5)
+    with torch.no_grad():
+        model.features.table.normal_(generator=torch.Generator().manual_seed(0))  # pyright: ignore
+    where = seen(model, 100.0)
+    cells(model).occupied.copy_(cells(model).possible)
+    before = {key: value.clone() for key, value in model.eval()(tiny_rays(RAYS)).items()}
+    judged(model.train(), 2 * EARLY)
+    assert cells(model).splits.tolist() == [1, 0]
+    owned = torch.zeros_like(cells(model).possible)
+    owned[tuple(slice(2 * int(at) - 2, 2 * int(at) + 4) for at in where)] = True
+    assert torch.equal(model.features.owned, owned)  # pyright: ignore
+    assert bool(cells(model).occupied[owned].all())
+    cells(model).occupied.copy_(cells(model).possible)
+    model.config = replace(model.config, step_cells=1.0)  # as long a step as before
+    for key, value in model.eval()(tiny_rays(RAYS)).items():
+        torch.testing.assert_close(value, before[key], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("reason", ["nothing is solid", "no splits left", "not the time"])
+def test_cells_stay_large(reason: str) -> None:
+    model = open_model(0 if reason == "no splits left" else 1)
+    seen(model, 0.9 * SOLID / SIDE if reason == "nothing is solid" else 100.0)
+    before = int(cells(model).occupied.sum())
+    assert judged(model, 3 * EARLY + 1 if reason == "not the time" else 2 * EARLY) == before
+    assert cells(model).splits[0] == 0
+
+
+@pytest.mark.parametrize("room", [6**3, 6**3 - 1])
+def test_cells_are_split_again_once_they_are_few_enough(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lean, "MOST_CELLS", room)
+    model = open_model(2)
+    for step in (2, 3):
+        seen(model, 100.0)
+        judged(model, step * EARLY)
+    assert cells(model).splits.tolist() == ([2, 0] if room == 6**3 else [1, 1])
+
+
+def test_what_was_left_out_by_mistake_is_tried_again_found_and_split() -> None:
+    model = open_model()
+    assert model.features is not None
+    seen(model, 100.0)
+    judged(model, 2 * EARLY)
+    owned, elsewhere = model.features.owned.clone(), (3, 3, 3)
+    assert not bool(owned[elsewhere])
+    tried = torch.zeros_like(owned)
+    for again in range(3, 200):
+        judged(model, again * JUDGE_EVERY)
+        tried |= cells(model).occupied
+    assert bool(tried[cells(model).possible].float().mean() > 0.8)
+    cells(model).largest[elsewhere] = 100.0
+    judged(model, 200 * JUDGE_EVERY)
+    assert bool(cells(model).occupied[elsewhere])
+    assert bool(model.features.owned[elsewhere])
+    assert torch.equal(model.features.owned & owned, owned)
+
+
+def test_a_state_with_split_cells_is_taken_up_with_and_without_the_scene() -> None:
+    model = open_model(2)
+    for step in (2, 3):
+        seen(model, 100.0)
+        judged(model, step * EARLY)
+    assert cells(model).splits.tolist() == [2, 0]
+    assert model.features is not None
+    with torch.no_grad():
+        model.features.table.normal_(generator=torch.Generator().manual_seed(0))
+    rays = tiny_rays(RAYS)
+    unsettled = LeanModel(model.config, np.random.default_rng(5)).double()
+    for other in (open_model(2), unsettled):
+        other.load_state_dict(model.state_dict())
+        assert torch.equal(other.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
+        assert torch.equal(cells(other).occupied, cells(model).occupied)
+    with pytest.raises(InputError, match="cells are not the checkpoint's"):
+        open_model(1).load_state_dict(model.state_dict())
