@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -48,17 +50,10 @@ def test_what_is_linear_is_exact_in_between() -> None:
     features = FeatureGrid(cells, 4).double()
     rng = np.random.default_rng(1)
     slope, offset = torch.from_numpy(rng.normal(size=(3, 4))), torch.from_numpy(rng.normal(size=4))
-    corners = torch.from_numpy(np.argwhere(np.ones([n + 1 for n in cells.possible.shape])))
-    positions = cells.corner + corners * SIDE
+    corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
     with torch.no_grad():
-        values = positions @ slope + offset
-        used = torch.zeros(len(corners), dtype=torch.bool)
-        flat = cells.possible
-        for i, j, k in torch.nonzero(flat).tolist():
-            for a in range(8):
-                at = (i + (a >> 2), j + (a >> 1 & 1), k + (a & 1))
-                used[np.ravel_multi_index(at, [n + 1 for n in flat.shape])] = True
-        features.table[features.place[used]] = values[used]
+        positions = cells.corner + (features.low[:, None] + corners) * SIDE
+        features.table[features.rows] = positions @ slope + offset
     points = inside(shown)
     torch.testing.assert_close(features_at(features, points), points @ slope + offset)
 

@@ -81,7 +81,9 @@ def test_culled_rendering_equals_rendering_everything_with_nothing_outside(
     assert one is not None
     assert other is not None
     with torch.no_grad():
-        other.table[other.place] = one.table[one.place]
+        shape = cells(whole).occupied.shape
+        number = other.number[np.ravel_multi_index(one.low.long().T.numpy(), shape)]
+        other.table[other.rows[number.long()]] = one.table[one.rows]
     inside = cells(culled).contains
     field = whole.fine.forward
 
@@ -334,8 +336,8 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
     large = needs(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
-    assert f"split to {large.hull.side / 2:.4f} where training finds something" in unlocated
-    assert "split" not in said["cells"]
+    assert f"training begins with {large.hull.side:.4f}, split to {large.hull.side / 2:.4f} where" in unlocated
+    assert f"training begins with {2 * told.hull.side:.4f}, split to {told.hull.side:.4f} where" in said["cells"]
     whole = large.hull.cells
     assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
     for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf"), ("--step-cells", "1e-5")):

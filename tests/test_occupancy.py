@@ -150,8 +150,28 @@ def test_a_split_moves_nothing() -> None:
         assert sides == (SIDE, SIDE / 2**done, SIDE / 4)
         torch.testing.assert_close(grid.middle, whole.middle)
         assert float(grid.reach) == float(whole.reach)
-        assert torch.equal(grid.possible_at_first, whole.possible)
+        assert torch.equal(grid.possible_after(0), whole.possible)
     first, splits = OccupancyGrid.at_first(grid.state_dict())
     assert splits == 2
     assert not first.is_the_same_as(whole.float())  # may be split, that one not
     assert first.is_the_same_as(OccupancyGrid.of(Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown), 2))
+
+
+def test_doubled_cells_have_whatever_the_hull_has_and_split_are_the_hull() -> None:
+    shown, points = cells(), torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (5000, 3)))
+    hull = Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown)
+    grid, whole = OccupancyGrid.of(hull, 2, 2).double(), grid_of(shown)
+    inside = whole.contains(points)
+    assert float(grid.side) == 4 * SIDE
+    cell = grid.locate(points)
+    assert torch.equal(grid.contains(points), torch.isin(cell, cell[inside]))
+    rim = torch.ones_like(grid.possible)
+    rim[1:-1, 1:-1, 1:-1] = False
+    assert not bool((grid.possible & rim).any())
+    for _ in range(2):
+        grid.split()
+    assert torch.equal(grid.contains(points), inside)
+    first, splits = OccupancyGrid.at_first(grid.state_dict())
+    assert splits == 2
+    assert first.is_the_same_as(OccupancyGrid.of(hull, 2, 2))
+    assert not first.is_the_same_as(OccupancyGrid.of(hull, 2, 1))

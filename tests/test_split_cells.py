@@ -58,6 +58,24 @@ def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_other
         torch.testing.assert_close(value, before[key], rtol=0, atol=1e-9)
 
 
+def test_split_cells_are_none_but_the_hulls() -> None:
+    shown = torch.rand((8, 8, 8), generator=torch.Generator().manual_seed(0)) < 0.5
+    shown[3:5, 3:5, 3:5] = True
+    model = LeanModel(LeanModelConfig("tiny", 8, 2, 2, 1, features=3), np.random.default_rng(0))
+    model.settle(OccupancyGrid.of(Hull(np.full(3, -1.2), SIDE, shown.numpy()), 1, 1))
+    assert bool(cells(model).possible[2:4, 2:4, 2:4].all())  # of two cells each, and a rim
+    seen(model, 100.0)
+    judged(model, 2 * EARLY)
+    expected = torch.zeros_like(cells(model).possible)
+    expected[2:-2, 2:-2, 2:-2] = shown
+    assert torch.equal(cells(model).possible, expected)
+    assert bool(cells(model).occupied.any())
+    assert not bool((cells(model).occupied & ~expected).any())
+    owned = model.features.owned  # pyright: ignore
+    assert bool(owned.any())
+    assert not bool((owned & ~expected).any())
+
+
 @pytest.mark.parametrize("reason", ["nothing is solid", "no splits left", "not the time"])
 def test_cells_stay_large(reason: str) -> None:
     model = open_model(0 if reason == "no splits left" else 1)

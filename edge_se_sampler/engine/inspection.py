@@ -46,6 +46,8 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
     hull, box = told.hull, told.box
     sizes = sorted({image.shape[1::-1] for image in views.images})
     whole = max(hull.cells.size, (2 * box.half / hull.side) ** 3)  # large cells may reach beyond the box
+    first = hull.side * 2**told.coarser
+    finest = first / 2**told.splits
     samples, along = _samples(views, told, live, config)
     distance = np.linalg.norm(views.camera_to_worlds[:, :, 3] - box.middle, axis=1)
     at = ", ".join(f"{value + 0.0:.2f}" for value in box.middle.round(2))
@@ -58,7 +60,7 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
         "silhouettes": f"{told.silhouettes} of {len(views.images)} views tell the object from its background by alpha",
         "cells": f"{hull.side:.4f} a side, {hull.side / told.footprint:.1f} pixels; {hull.cells.sum():,} of "
         f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)"
-        + (f", split to {hull.side / 2**told.splits:.4f} where training finds something" if told.splits else ""),
+        + (f"; training begins with {first:.4f}, split to {finest:.4f} where it sees any" if told.splits else ""),
         "rays": f"{100 * across:.1f} % of the pixels may cross them; such a ray has {samples:.1f} samples, {along:.0f} "
         "along all of its depth",
         "sampling": "uniform among them"

@@ -9,7 +9,6 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.nerf.economy import live_pixels, needs
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
 from edge_se_sampler.nerf.ray_model import RayModel
 from edge_se_sampler.sampling_settings import SamplingSettings
 from edge_se_sampler.streams import Stream, stream
@@ -34,7 +33,7 @@ class Pipeline:
         model = build_model(config, device)
         if model.needs_cells:
             told = needs(views, model_config)
-            model.settle(OccupancyGrid.of(told.hull, told.splits))
+            model.settle(told.grid())
             located = told.silhouettes > 0
             if manager_config.live_pixels_only and located:
                 views = views.masked(live_pixels(views, told.hull))

@@ -33,6 +33,8 @@ MOST_PLACES = 2**24
 """Cells of the box around them, which grids have a number for, occupied or not."""
 TOLERATED = 0.01
 """Share of the foreground's pixels that may meet no cell, by stray ones."""
+COARSER = 1
+"""How often a hull's cells are doubled where training is to split them."""
 LOOKED_AT = 4096
 ROUGH = 64
 """Cells along the box of a first hull, which tells how many finer ones there will be."""
@@ -49,22 +51,29 @@ class Needs:
     """Views whose alpha tells the object from the background."""
     hull: Hull
     """The cells that may hold something."""
+    coarser: int
+    """How often their sides are doubled for training to begin with."""
     splits: int
-    """How often training may halve their sides, where it finds something."""
+    """How often training may halve them, where it finds something."""
+
+    def grid(self) -> OccupancyGrid:
+        """The cells, as training begins with them."""
+        return OccupancyGrid.of(self.hull, self.splits, self.coarser)
 
 
 def needs(views: Views, config: ModelConfig) -> Needs:
     """Derive what training views need under a resolved config.
 
-    Where nothing is carved away and training is to tell which cells are empty, it begins with large ones, few enough
-    for each to be split.
+    Where training is to tell which cells are empty, it begins with large ones: of the hull, twice as large; where
+    nothing is carved away, few enough for each to be split.
 
     Raises:
         InputError: the cameras see nothing of what they look at.
     """
     lean = config if isinstance(config, LeanModelConfig) else None
     by_alpha = config.economy == "auto" and (lean is None or lean.cull_by_alpha)
-    at_first = MOST_CELLS // 8 if lean is not None and lean.learns_cells else MOST_CELLS
+    learns = lean is not None and lean.learns_cells
+    at_first = MOST_CELLS // 8 if learns else MOST_CELLS
     box = box_of(views, config.near, config.far)
     pixel = footprint(views, box)
     side = config.cell_pixels * pixel
@@ -82,7 +91,8 @@ def needs(views: Views, config: ModelConfig) -> Needs:
             "no training view sees anything of what lies between --pipeline.model.near and far around "
             f"({', '.join(f'{x:.2f}' for x in box.middle)}): check the cameras' poses and principal points"
         )
-    return Needs(box, pixel, len(shown), hull, 0 if shown or at_first == MOST_CELLS else _splits(hull, side))
+    coarser = COARSER if learns and shown else 0
+    return Needs(box, pixel, len(shown), hull, coarser, coarser or (_splits(hull, side) if learns else 0))
 
 
 def _splits(hull: Hull, side: float) -> int:
@@ -123,8 +133,16 @@ def spread_pixels(masks: Mapping[int, np.ndarray], most: int) -> torch.Tensor:
 
 def live_pixels(views: Views, hull: Hull) -> list[np.ndarray]:
     """(H, W) bool of each view: all pixels whose ray meets a cell of the hull, and few others."""
-    centers = hull.corner + (np.argwhere(hull.cells) + 0.5) * hull.side
+    centers = hull.corner + (np.argwhere(_outermost(hull.cells)) + 0.5) * hull.side
     return [_covered(views, number, centers, hull.side) for number in range(len(views.images))]
+
+
+def _outermost(cells: np.ndarray) -> np.ndarray:
+    """(X, Y, Z) bool: cells with another side than those of cells; what comes in from outside meets one of them."""
+    inner = np.pad(cells, 1)
+    for axis in range(3):
+        inner = inner & np.roll(inner, 1, axis) & np.roll(inner, -1, axis)
+    return cells & ~inner[1:-1, 1:-1, 1:-1]
 
 
 def _covered(views: Views, number: int, centers: np.ndarray, side: float) -> np.ndarray:
@@ -132,12 +150,12 @@ def _covered(views: Views, number: int, centers: np.ndarray, side: float) -> np.
     is around the camera or as large as the image."""
     height, width = views.images[number].shape[:2]
     low, high, where = projected(views, number, centers, side)
-    shown = (where == AHEAD) & ((high > 0) & (low < (width, height))).all(axis=1)
-    low, high = low[shown], high[shown]
+    shown = (where == AHEAD) & (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
+    low, high = low[:, shown], high[:, shown]
     reach = int(np.ceil((high - low).max(initial=0) / 2)) + 1
     if (where == AROUND).any() or reach > max(height, width):
         return np.ones((height, width), dtype=bool)
-    column, row = np.floor((low + high) / 2).astype(np.int64).T + reach
+    column, row = np.floor((low + high) / 2).astype(np.int64) + reach
     wide = np.zeros((height + 2 * reach, width + 2 * reach), dtype=np.uint8)
     wide[row, column] = 1
     count, size = cv2.integral(wide), 2 * reach + 1

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.nerf.occupancy import OccupancyGrid, resized
 
 
 class FeatureGrid(nn.Module):
@@ -29,20 +29,18 @@ class FeatureGrid(nn.Module):
 
     owned: Tensor
     """(X, Y, Z) bool: today's cells that have corners of their own level."""
-    place: Tensor
-    """Row of each corner in the table, the first level's (X + 1) (Y + 1) (Z + 1) and then the second's; that of no
-    cell's: any."""
-    start: Tensor
-    """(1|2,) int64: where each level begins in `place`; one, as long as nothing is split."""
-    stride: Tensor
-    """(1|2, 3) int64: how much farther in `place` the next corner is, along each axis."""
-    offsets: Tensor
-    """(1|2, 8) int64: the same for each corner of a cell."""
+    number: Tensor
+    """(X Y Z,) int32: row, in the next two, of today's cells: first the K cells there were at first, then those that
+    are owned; that of none of them: any."""
+    rows: Tensor
+    """(K + L, 8) int64: a cell's corners in the table."""
+    low: Tensor
+    """(K + L, 3) where a cell begins, in sides of its level's cells."""
 
     def __init__(self, grid: OccupancyGrid, size: int) -> None:
         super().__init__()
         self.grid = [grid]  # not a part of this one
-        self.register_buffer("owned", torch.zeros_like(grid.possible))
+        self.register_buffer("owned", torch.zeros_like(grid.occupied))
         self.table = nn.Parameter(torch.zeros(self._lay_out(), size))
 
     @torch.no_grad()
@@ -53,14 +51,15 @@ class FeatureGrid(nn.Module):
             owned: (X, Y, Z) bool; twice as many along each axis as there are today: the grid is split first.
         """
         (grid,) = self.grid
-        sides = (grid.first_side, grid.side * len(grid.possible) / len(owned))
-        shown = zip((grid.possible_at_first, owned), sides, strict=True)
+        sides = (grid.first_side, grid.side * len(grid.occupied) / len(owned))
+        shown = zip((grid.possible_after(0), owned), sides, strict=True)
         where = torch.cat([grid.corner + torch.nonzero(_corners(cells)) * side for cells, side in shown])
         around = where[:, None] + (torch.tensor(_CORNERS, device=where.device) - 0.5) * (sides[1] / 2)
         cell = grid.locate(around.reshape(-1, 3)).reshape(-1, 8)
-        finest = self.owned.reshape(-1)[cell].int().argmax(dim=1, keepdim=True)  # a corner is its finest cell's
+        level = resized(grid.possible_after(0), len(self.owned)).int() + self.owned
+        finest = level.reshape(-1)[cell].argmax(dim=1, keepdim=True)  # a corner is its finest cell's
         known = self(where, cell.gather(1, finest)[:, 0])
-        if len(owned) > len(grid.possible):
+        if len(owned) > len(grid.occupied):
             grid.split()
         self.owned = owned
         self._lay_out()
@@ -69,38 +68,35 @@ class FeatureGrid(nn.Module):
     def forward(self, positions: Tensor, cell: Tensor) -> Tensor:
         """(m, 3) world units and (m,) int64 numbers of their cells, possible ones -> (m, F)."""
         (grid,) = self.grid
-        split = len(self.start) > 1  # if not, one level for all, rather than one for each
-        level = self.owned.reshape(-1)[cell].long() if split else self.start.new_zeros(1)
-        at = (positions - grid.corner) / torch.stack((grid.first_side, grid.side))[level][:, None]
-        low = at.floor()
-        share = at - low
-        corner = self.start[level] + (low.long() * self.stride[level]).sum(dim=1)
-        rows = self.place[corner[:, None] + self.offsets[level]]
+        number = self.number.index_select(0, cell)
+        side = grid.first_side
+        if self.first < len(self.rows):
+            side = torch.where(number < self.first, side, grid.side)[:, None]
+        share = ((positions - grid.corner) / side - self.low.index_select(0, number)).clamp(0, 1)
         x, y, z = torch.stack((1 - share, share), dim=2).unbind(1)
         weight = (x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]).reshape(-1, 8)
-        return _Weighted.apply(self.table, rows, weight)
+        return _Weighted.apply(self.table, self.rows.index_select(0, number), weight)
 
     def _lay_out(self) -> int:
         """Find a row for every corner of both levels; how many that takes."""
         (grid,) = self.grid
-        places, starts, strides, rows, size = [], [], [], 0, 0
-        for cells in (grid.possible_at_first, self.owned):
-            if places and not cells.any():  # nothing is split: one level
-                continue
-            corners = _corners(cells)
-            _, wide, deep = corners.shape
-            starts.append(size)
-            strides.append((wide * deep, deep, 1))
-            places.append((corners.reshape(-1).cumsum(0) - 1).clamp(min=0) + rows)
-            rows, size = rows + int(corners.sum()), size + corners.numel()
-        device = self.owned.device
-        stride = torch.tensor(strides, device=device)
-        self.register_buffer("place", torch.cat(places), persistent=False)
-        self.register_buffer("start", torch.tensor(starts, device=device), persistent=False)
-        self.register_buffer("stride", stride, persistent=False)
-        offsets = (stride[:, None] * torch.tensor(_CORNERS, device=device)).sum(dim=2)
-        self.register_buffer("offsets", offsets, persistent=False)
-        return rows
+        first, corners = grid.possible_after(0), 0
+        rows, lows, numbers = [], [], []
+        for cells in (first, self.owned):
+            stored, low = _corners(cells), torch.nonzero(cells)
+            _, wide, deep = stored.shape
+            offsets = torch.tensor([(i * wide + j) * deep + k for i, j, k in _CORNERS], device=low.device)
+            place = ((low[:, 0] * wide + low[:, 1]) * deep + low[:, 2])[:, None] + offsets
+            rows.append((stored.reshape(-1).cumsum(0) - 1 + corners)[place])
+            lows.append(low.to(grid.corner.dtype))
+            numbers.append((cells.reshape(-1).cumsum(0) - 1).clamp(min=0).reshape(cells.shape))
+            corners += int(stored.sum())
+        self.first = len(lows[0])
+        number = torch.where(self.owned, self.first + numbers[1], resized(numbers[0], len(self.owned)))
+        self.register_buffer("number", number.reshape(-1).int(), persistent=False)
+        self.register_buffer("rows", torch.cat(rows), persistent=False)
+        self.register_buffer("low", torch.cat(lows), persistent=False)
+        return corners
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """As torch's; the state's cells have corners of their own from now on."""

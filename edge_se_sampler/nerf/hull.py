@@ -27,6 +27,10 @@ WITNESSES = 2
 """Views that must see a cell to be empty, where there are as many."""
 FIRST_CELLS = 16
 """Cells along the box when carving begins."""
+FEWER = 0.8
+"""Share of cells still in question below which the others are dropped: copying costs, too."""
+ROUNDED = 1e-5
+"""Projections are float32, which is a hundredth of a pixel in the largest image."""
 AHEAD, AROUND, BEHIND = 1, 0, -1
 """Where a cell is, seen from a camera's plane."""
 
@@ -53,14 +57,12 @@ class Silhouette:
     """It keeps clear of the image's border, which therefore shows all of the object."""
 
     def shows(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """(m,) bool: rectangles of u, v (m, 2) that have foreground in them, or MARGIN pixels around."""
+        """(m,) bool: rectangles of u, v (2, m) that have foreground in them, or MARGIN pixels around."""
         height, width = self.count.shape
-        left, top = (np.floor(low).astype(np.int64) - MARGIN).T
-        right, bottom = (np.ceil(high).astype(np.int64) + MARGIN).T
-        left, right = left.clip(0, width - 1), right.clip(0, width - 1)
-        top, bottom = top.clip(0, height - 1), bottom.clip(0, height - 1)
-        corners = self.count[bottom, right] - self.count[top, right] - self.count[bottom, left] + self.count[top, left]
-        return corners > 0
+        left, top = _within(np.floor(low[0]) - MARGIN, width), _within(np.floor(low[1]) - MARGIN, height) * width
+        right, bottom = _within(np.ceil(high[0]) + MARGIN, width), _within(np.ceil(high[1]) + MARGIN, height) * width
+        count = self.count.reshape(-1)
+        return count[bottom + right] - count[top + right] > count[bottom + left] - count[top + left]
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,11 @@ def silhouettes(views: Views) -> dict[int, Silhouette]:
     return found
 
 
+def _within(places: np.ndarray, size: int) -> np.ndarray:
+    """Whole numbers, as near to those places as there are among `size`."""
+    return places.clip(0, size - 1).astype(np.int64)
+
+
 def _silhouette(mask: np.ndarray) -> Silhouette:
     inner = mask[MARGIN:-MARGIN, MARGIN:-MARGIN]
     return Silhouette(cv2.integral(mask.astype(np.uint8)), np.count_nonzero(inner) == np.count_nonzero(mask))
@@ -144,30 +151,41 @@ def _grid(size: int) -> np.ndarray:
 
 def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side: float) -> np.ndarray:
     """(m,) bool: cells that some view sees and that too few see to be empty."""
-    empty = np.zeros(len(centers), dtype=np.int32)
-    seen = np.zeros(len(centers), dtype=bool)
+    witnesses = min(WITNESSES, max(1, len(shown)))
+    stays = np.zeros(len(centers), dtype=bool)
+    left = np.arange(len(centers))  # those that are not known to be empty, and some that are
+    seen, empty = np.zeros((2, len(centers)), dtype=np.uint8)
     for number, image in enumerate(views.images):
-        low, high, where = projected(views, number, centers, side)
-        size = np.array([image.shape[1], image.shape[0]])
+        low, high, where = projected(views, number, centers[left], side)
+        height, width = image.shape[:2]
         ahead = where == AHEAD
-        seen |= ((high > 0) & (low < size)).all(axis=1) & ahead | (where == AROUND)
+        inside = (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
+        seen |= inside & ahead | (where == AROUND)
         if number in shown:
             silhouette = shown[number]
-            told = ahead if silhouette.whole else ahead & ((low >= 0) & (high <= size)).all(axis=1)
+            whole = (low[0] >= 0) & (low[1] >= 0) & (high[0] <= width) & (high[1] <= height)
+            told = ahead if silhouette.whole else ahead & whole
             empty += told & ~silhouette.shows(low, high)
-    return seen & (empty < min(WITNESSES, max(1, len(shown))))
+            asked = empty < witnesses
+            if np.count_nonzero(asked) < FEWER * len(asked):
+                left, seen, empty = left[asked], seen[asked], empty[asked]
+    stays[left] = (seen > 0) & (empty < witnesses)
+    return stays
 
 
 def projected(views: Views, number: int, centers: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rectangles that cells project into: least and greatest u, v (m, 2), and whether each cell is all AHEAD, all
+    """Rectangles that cells project into: least and greatest u, v (2, m), and whether each cell is all AHEAD, all
     BEHIND, or AROUND the camera's plane (m,); only those ahead have a rectangle that means something."""
     pose = views.camera_to_worlds[number]
-    x, y, z = ((centers - pose[:, 3]) @ (pose[:, :3] * (1, -1, -1))).T
-    half_x, half_y, half_z = side / 2 * np.abs(pose[:, :3]).sum(axis=0)
-    where = np.sign(z) * (np.abs(z) > half_z * (1 + 1e-9))
+    axes = pose[:, :3] * (1, -1, -1)
+    x, y, z = (axes.T @ (centers - pose[:, 3]).T).astype(np.float32)
+    half_x, half_y, half_z = (side / 2 * np.abs(axes).sum(axis=0)).tolist()
+    where = np.where(z > half_z * (1 + ROUNDED), AHEAD, np.where(z < -half_z * (1 + ROUNDED), BEHIND, AROUND))
     z = np.where(where == AHEAD, z, half_z + 1)
     reach = 1 / (z * (z - half_z))
-    off = np.stack(((half_x * z + np.abs(x) * half_z) * reach, (half_y * z + np.abs(y) * half_z) * reach), axis=1)
-    at = np.stack((x / z, y / z), axis=1) * views.focal[number] + views.principal[number]
-    off = off * views.focal[number]
-    return at - off, at + off, where
+    low, high = np.empty((2, 2, len(z)), dtype=np.float32)
+    for k, (along, half) in enumerate(((x, half_x), (y, half_y))):
+        focal, principal = float(views.focal[number, k]), float(views.principal[number, k])
+        at, off = along / z * focal + principal, (half * z + np.abs(along) * half_z) * reach * focal
+        low[k], high[k] = at - off, at + off
+    return low, high, where

@@ -152,7 +152,7 @@ class LeanModel(RayModel):
             grid.largest.zero_()
             return
         share = TRIED_AGAIN / 2 ** int(grid.splits[0])
-        again = torch.rand(grid.possible.shape, generator=self.random, device=self.device) < share
+        again = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < share
         kept = grid.judge(-math.log1p(-LEAST_OPACITY) / float(grid.finest_side), again)
         self._refine(grid, kept, solid)
 
@@ -166,7 +166,7 @@ class LeanModel(RayModel):
         features = self.features
         done, left = grid.splits.tolist()
         if left and (done == 0 or 8 * kept.sum() <= MOST_CELLS):
-            grid.split() if features is None else features.own(halved(kept))
+            grid.split() if features is None else features.own(halved(kept) & grid.possible_after(done + 1))
         elif features is not None and done:
             missed = solid & ~features.owned
             owned = features.owned | (with_neighbours(missed) & grid.possible)

@@ -48,33 +48,39 @@ class OccupancyGrid(nn.Module):
     Args:
         corner: (3,) world units: where the box has its least coordinates.
         side: h.
-        possible: (X, Y, Z) bool; the outermost False.
-        splits: how often its cells may be halved along every axis.
+        hull: (X, Y, Z) bool: what may hold something, in cells of h, or its half, its quarter, ...; none of the grid's
+            outermost cells.
+        splits: how often the grid's cells may be halved along every axis.
+        coarser: how often the hull's cells have to be doubled to be the grid's.
     """
 
     corner: Tensor
     side: Tensor
-    possible: Tensor
+    hull: Tensor
     occupied: Tensor
     largest: Tensor
     """(X, Y, Z) density seen in each cell since the last judgement."""
     splits: Tensor
     """(2,) int64: how often cells have been split, and how often they still may be."""
 
-    def __init__(self, corner: Tensor, side: float, possible: Tensor, splits: int = 0) -> None:
+    def __init__(self, corner: Tensor, side: float, hull: Tensor, splits: int = 0, coarser: int = 0) -> None:
         super().__init__()
+        shape = [size // 2**coarser for size in hull.shape]
         self.register_buffer("corner", corner.float())
         self.register_buffer("side", torch.tensor(side, dtype=torch.float32))
-        self.register_buffer("possible", possible.clone())
-        self.register_buffer("occupied", possible.clone())
-        self.register_buffer("largest", torch.zeros(possible.shape))
+        self.register_buffer("hull", hull.clone())
+        self.register_buffer("occupied", resized(hull, shape[0]))
+        self.register_buffer("largest", torch.zeros(shape))
         self.register_buffer("splits", torch.tensor((0, splits)))
 
     @classmethod
-    def of(cls, hull: Hull, splits: int = 0) -> OccupancyGrid:
-        """The hull's cells, all occupied, with an empty rim: what rounding puts outside of the box is in none."""
-        possible = F.pad(torch.from_numpy(hull.cells), (1,) * 6)
-        return cls(torch.from_numpy(hull.corner - hull.side), hull.side, possible, splits)
+    def of(cls, hull: Hull, splits: int = 0, coarser: int = 0) -> OccupancyGrid:
+        """The hull's cells, or so much larger ones that have any of them, all occupied, with an empty rim: what
+        rounding puts outside of the box is in none."""
+        rim = 2**coarser
+        ends = [rim + -size % rim for size in reversed(hull.cells.shape)]
+        cells = F.pad(torch.from_numpy(hull.cells), [size for end in ends for size in (rim, end)])
+        return cls(torch.from_numpy(hull.corner - rim * hull.side), rim * hull.side, cells, splits, coarser)
 
     @property
     def first_side(self) -> Tensor:
@@ -87,44 +93,48 @@ class OccupancyGrid(nn.Module):
         return self.side / 2 ** self.splits[1]
 
     @property
-    def possible_at_first(self) -> Tensor:
-        """The possible cells before any split."""
-        every = 2 ** int(self.splits[0])
-        return self.possible[::every, ::every, ::every]
+    def possible(self) -> Tensor:
+        """(X, Y, Z) bool: cells that have anything of the hull."""
+        return self.possible_after(int(self.splits[0]))
+
+    def possible_after(self, splits: int) -> Tensor:
+        """The same when they have been split so often, since the first."""
+        return resized(self.hull, (len(self.occupied) << splits) >> int(self.splits[0]))
 
     @classmethod
     def at_first(cls, state: Mapping[str, Tensor]) -> tuple[OccupancyGrid, int]:
         """What the grid of a state was before any judgement, and how often its cells have been split since."""
         done, left = state["splits"].tolist()
-        possible = state["possible"][:: 2**done, :: 2**done, :: 2**done]
-        return cls(state["corner"], float(state["side"]) * 2**done, possible, done + left), done
+        coarser = (len(state["hull"]) * 2**done // len(state["occupied"])).bit_length() - 1
+        return cls(state["corner"], float(state["side"]) * 2**done, state["hull"], done + left, coarser), done
 
     def is_the_same_as(self, other: OccupancyGrid) -> bool:
         """Whether both have the same cells, split as often."""
-        told = ("corner", "side", "possible", "splits")
-        return all(torch.equal(getattr(self, key).cpu(), getattr(other, key).cpu()) for key in told)
+        told = ("corner", "side", "hull", "splits")
+        same = self.occupied.shape == other.occupied.shape
+        return same and all(torch.equal(getattr(self, key).cpu(), getattr(other, key).cpu()) for key in told)
 
     def split(self) -> None:
         """Halve all cells along every axis."""
-        for name in ("possible", "occupied", "largest"):
-            setattr(self, name, halved(getattr(self, name)))
+        self.occupied = halved(self.occupied) & self.possible_after(int(self.splits[0]) + 1)
+        self.largest = halved(self.largest)
         self.side = self.side / 2
         self.splits = self.splits + torch.tensor((1, -1), device=self.splits.device)
 
     @property
     def middle(self) -> Tensor:
         """(3,) of the box."""
-        return self.corner + self.side * torch.tensor(self.possible.shape, device=self.corner.device) / 2
+        return self.corner + self.side * torch.tensor(self.occupied.shape, device=self.corner.device) / 2
 
     @property
     def reach(self) -> Tensor:
         """Half the longest edge of the box."""
-        return self.side * max(self.possible.shape) / 2
+        return self.side * max(self.occupied.shape) / 2
 
     def locate(self, positions: Tensor) -> Tensor:
         """(m, 3) world units -> (m,) int64 number of the cell; the rim's where it is outside of the box."""
         at = (positions - self.corner) / self.side
-        size = torch.tensor(self.possible.shape, device=at.device)
+        size = torch.tensor(self.occupied.shape, device=at.device)
         at = torch.minimum(at.floor().long().clamp(min=0), size - 1)
         return (at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2]
 
@@ -152,7 +162,7 @@ class OccupancyGrid(nn.Module):
         within = torch.minimum(t, end)  # beyond, cell numbers would mean nothing
         cell = torch.zeros(t.shape, dtype=torch.int64, device=t.device)
         origin, direction = (rays.origins - self.corner) / self.side, rays.directions / self.side
-        for axis, size in enumerate(self.possible.shape):
+        for axis, size in enumerate(self.occupied.shape):
             at = torch.addcmul(origin[:, axis : axis + 1], within, direction[:, axis : axis + 1])
             cell = cell * size + at.long().clamp_(0, size - 1)
         inside &= self.occupied.reshape(-1)[cell]
@@ -165,7 +175,7 @@ class OccupancyGrid(nn.Module):
 
     def _span(self, rays: RayBundle) -> tuple[Tensor, Tensor]:
         """Where rays enter and leave the box, (n, 1) each; the end is not after the beginning for those that miss."""
-        far = self.corner + self.side * torch.tensor(self.possible.shape, device=self.corner.device)
+        far = self.corner + self.side * torch.tensor(self.occupied.shape, device=self.corner.device)
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         one, other = (self.corner - rays.origins) * inverse, (far - rays.origins) * inverse
         begin = torch.minimum(one, other).amax(dim=1, keepdim=True).clamp(min=0)
@@ -203,3 +213,14 @@ def with_neighbours(cells: Tensor) -> Tensor:
 def halved(cells: Tensor) -> Tensor:
     """(X, Y, Z) -> (2 X, 2 Y, 2 Z): each cell's value for its eight parts."""
     return cells.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+
+def resized(cells: Tensor, length: int) -> Tensor:
+    """(X, Y, Z) bool: the same space in cells of another size, `length` of them along x: parts of each, or those that
+    have anything of one."""
+    while len(cells) < length:
+        cells = halved(cells)
+    while len(cells) > length:
+        x, y, z = cells.shape
+        cells = cells.reshape(x // 2, 2, y // 2, 2, z // 2, 2).any(5).any(3).any(1)
+    return cells

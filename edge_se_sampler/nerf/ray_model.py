@@ -74,7 +74,7 @@ class RayModel(nn.Module, ABC):
             InputError: it is another model's, or the model is settled in other cells: features would lie at other
                 corners.
         """
-        if "grid.splits" in state_dict:
+        if "grid.hull" in state_dict:
             told = {key.removeprefix("grid."): told for key, told in state_dict.items() if key.startswith("grid.")}
             first, splits = OccupancyGrid.at_first(told)
             if self.grid is None:
