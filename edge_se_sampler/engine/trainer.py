@@ -109,7 +109,7 @@ class Trainer:
         seed = self.config.machine.seed
         model.begin_step(step, int(stream(seed, step, Stream.MODEL).integers(2**63)))
         rays, batch = self.pipeline.datamanager.next_train(step)
-        self.optimizer.zero_grad(set_to_none=False)
+        self.optimizer.zero_grad()
         batch.pop("full_image", None)  # not of these rays alone
         errors = []
 
