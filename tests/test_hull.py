@@ -213,6 +213,29 @@ def _whole(mask: np.ndarray) -> Any:
     return hull_module.Silhouette(cv2.integral(mask.astype(np.uint8)), True)
 
 
+@pytest.mark.parametrize("fewer", [0.0, 2.0])
+def test_cells_that_are_known_to_be_empty_may_be_dropped(fewer: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    views = views_of(rods(), 60)
+    expected = hull_of(views)
+    monkeypatch.setattr(hull_module, "FEWER", fewer)  # never, always
+    found = hull_of(views)
+    np.testing.assert_array_equal(found.cells, expected.cells)
+    np.testing.assert_array_equal(found.corner, expected.corner)
+
+
+def test_hundreds_of_views_carve_as_a_few_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as a byte cannot count."""
+    views = views_of(rods(), 40, 4)
+    often = replace(
+        views, names=views.names * 64, images=views.images * 64,
+        camera_to_worlds=np.tile(views.camera_to_worlds, (64, 1, 1)), focal=np.tile(views.focal, (64, 1)),
+        principal=np.tile(views.principal, (64, 1)),
+    )  # fmt: skip
+    monkeypatch.setattr(hull_module, "FEWER", 0.0)
+    monkeypatch.setattr(hull_module, "WITNESSES", 1)
+    np.testing.assert_array_equal(hull_of(often).cells, hull_of(views).cells)
+
+
 def test_what_is_masked_may_be_the_object() -> None:
     """Alpha is 0 where a mask forbids to look: nothing is carved there."""
     views = views_of(rods())

@@ -154,7 +154,8 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
     witnesses = min(WITNESSES, max(1, len(shown)))
     stays = np.zeros(len(centers), dtype=bool)
     left = np.arange(len(centers))  # those that are not known to be empty, and some that are
-    seen, empty = np.zeros((2, len(centers)), dtype=np.uint8)
+    empty = np.zeros(len(centers), dtype=np.int32)
+    seen = np.zeros(len(centers), dtype=bool)
     for number, image in enumerate(views.images):
         low, high, where = projected(views, number, centers[left], side)
         height, width = image.shape[:2]
@@ -169,7 +170,7 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
             asked = empty < witnesses
             if np.count_nonzero(asked) < FEWER * len(asked):
                 left, seen, empty = left[asked], seen[asked], empty[asked]
-    stays[left] = (seen > 0) & (empty < witnesses)
+    stays[left] = seen & (empty < witnesses)
     return stays
 
 
