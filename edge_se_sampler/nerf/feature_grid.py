@@ -29,9 +29,11 @@ class FeatureGrid(nn.Module):
 
     owned: Tensor
     """(X, Y, Z) bool: today's cells that have corners of their own level."""
+    first: int
+    """K: cells there were at first."""
     number: Tensor
-    """(X Y Z,) int32: row, in the next two, of today's cells: first the K cells there were at first, then those that
-    are owned; that of none of them: any."""
+    """(X Y Z,) int32: row, in the next two, of today's cells: first the K, then those that are owned; that of none of
+    them: any."""
     rows: Tensor
     """(K + L, 8) int64: a cell's corners in the table."""
     low: Tensor
@@ -80,9 +82,8 @@ class FeatureGrid(nn.Module):
     def _lay_out(self) -> int:
         """Find a row for every corner of both levels; how many that takes."""
         (grid,) = self.grid
-        first, corners = grid.possible_after(0), 0
-        rows, lows, numbers = [], [], []
-        for cells in (first, self.owned):
+        rows, lows, numbers, corners = [], [], [], 0
+        for cells in (grid.possible_after(0), self.owned):
             stored, low = _corners(cells), torch.nonzero(cells)
             _, wide, deep = stored.shape
             offsets = torch.tensor([(i * wide + j) * deep + k for i, j, k in _CORNERS], device=low.device)

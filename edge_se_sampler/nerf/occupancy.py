@@ -216,8 +216,8 @@ def halved(cells: Tensor) -> Tensor:
 
 
 def resized(cells: Tensor, length: int) -> Tensor:
-    """(X, Y, Z) bool: the same space in cells of another size, `length` of them along x: parts of each, or those that
-    have anything of one."""
+    """(X, Y, Z): the same space in cells of another size, `length` of them along x: parts of each; or, of bool, those
+    that have any of them."""
     while len(cells) < length:
         cells = halved(cells)
     while len(cells) > length:
