@@ -185,6 +185,10 @@ def test_methods_are_tabled_where_what_scores_them_was_trained_and_scene_by_scen
         ["", "chair", "mic"], [["lean-nerf", "20.00", "21.00"], ["Edge", "(10.00)", "11.00"]],
     )  # fmt: skip
     assert "| Edge | (10.00) | 11.00 |" in table(runs, [])
+    both = [{"scene": s, "seed": 0, "curve": [[1, 5.0], [60, p]]} for s, p in (("mic", 24), ("chair", 23), ("ship", 1))]
+    others = [GOOD, {**GOOD, "runs": both}, {**GOOD, "runs": [{**run, "seed": 1} for run in both]}]
+    assert rows_of_scenes(runs, others)[1][2:] == [["theirs", "23.00", "24.00"]]
+    assert "| theirs | 23.00 | 24.00 |" in table(runs, others)
     assert "Every scene" not in table([run for run in runs if run["scene"] == "mic"], [])
 
 

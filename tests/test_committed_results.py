@@ -211,7 +211,7 @@ def test_the_readme_quotes_the_chart():
         f"Without the hull drums ends at {end['no-hull', 'drums']} dB and mic at {end['no-hull', 'mic']}, seed 0; with "
         f"it at {end['lean', 'drums']} and {end['lean', 'mic']}."
     ) in " ".join((ROOT / "README.md").read_text().split())
-    _, scenes = rows_of_scenes(told["runs"])
+    _, scenes = rows_of_scenes(told["runs"], told["external"])
     assert all(in_readme(row) for row in scenes)
     dead = {row[0]: sum(end.startswith("(") for end in row[1:]) for row in scenes}
     assert {name for name, count in dead.items() if count} == {"Random", "SE"}

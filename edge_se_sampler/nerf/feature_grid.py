@@ -90,11 +90,11 @@ class FeatureGrid(nn.Module):
             place = ((low[:, 0] * wide + low[:, 1]) * deep + low[:, 2])[:, None] + offsets
             rows.append((stored.reshape(-1).cumsum(0) - 1 + corners)[place])
             lows.append(low.to(grid.corner.dtype))
-            numbers.append((cells.reshape(-1).cumsum(0) - 1).clamp(min=0).reshape(cells.shape))
+            numbers.append((cells.reshape(-1).cumsum(0, dtype=torch.int32) - 1).clamp(min=0).reshape(cells.shape))
             corners += int(stored.sum())
         self.first = len(lows[0])
         number = torch.where(self.owned, self.first + numbers[1], resized(numbers[0], len(self.owned)))
-        self.register_buffer("number", number.reshape(-1).int(), persistent=False)
+        self.register_buffer("number", number.reshape(-1), persistent=False)
         self.register_buffer("rows", torch.cat(rows), persistent=False)
         self.register_buffer("low", torch.cat(lows), persistent=False)
         return corners

@@ -96,13 +96,17 @@ def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
     return head, told
 
 
-def rows_of_scenes(runs: list[Run]) -> tuple[list[str], list[list[str]]]:
-    """Of the variants that were trained on all scenes with one seed, the least: PSNR at the end on each, in brackets
-    where nothing was learnt. No rows where there is one scene."""
+def rows_of_scenes(runs: list[Run], external: Sequence[dict[str, Any]] = ()) -> tuple[list[str], list[list[str]]]:
+    """Of the variants, and other programs, that were trained on all scenes with one seed, the least: PSNR at the end
+    on each, in brackets where nothing was learnt, as far as that is known. No rows where there is one scene."""
     scenes, seed = scenes_of(runs), min(run["seed"] for run in runs)
     ends = {(run["variant"], run["scene"]): run for run in runs if run["seed"] == seed}
     names = [name for name in VARIANTS if all((name, scene) in ends for scene in scenes)]
     told = [[VARIANTS[name].label, *(_end(ends[name, scene]) for scene in scenes)] for name in names]
+    for program in external:
+        theirs = {run["scene"]: run["curve"][-1][1] for run in program["runs"] if run["seed"] == seed}
+        if theirs.keys() >= set(scenes):
+            told.append([program["name"], *(_shown(theirs[scene]) for scene in scenes)])
     return ["", *scenes], told if len(scenes) > 1 else []
 
 
@@ -128,7 +132,7 @@ def table(runs: list[Run], external: Sequence[dict[str, Any]]) -> str:
     """Markdown of both."""
     head, rows = rows_of(runs)
     tables = {GROUPS[group]: (head, mine) for group, mine in rows.items()}
-    scenes, ends = rows_of_scenes(runs)
+    scenes, ends = rows_of_scenes(runs, external)
     if ends:
         tables["Every scene, one seed, at the end"] = (scenes, ends)
     if external:
