@@ -101,11 +101,12 @@ def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
 
 
 def rows_of_scenes(runs: list[Run], external: Sequence[dict[str, Any]] = ()) -> tuple[list[str], list[list[str]]]:
-    """Of the variants, and other programs, that were trained on all scenes with one seed, the least: PSNR at the end
+    """Of methods and scorings, and other programs, that were trained on all scenes with one seed, the least: PSNR at the end
     on each, in brackets where nothing was learnt, as far as that is known. No rows where there is one scene."""
     scenes, seed = scenes_of(runs), min(run["seed"] for run in runs)
     ends = {(run["variant"], run["scene"]): run for run in runs if run["seed"] == seed}
-    names = [name for name in VARIANTS if all((name, scene) in ends for scene in scenes)]
+    top = [name for name, variant in VARIANTS.items() if variant.group in TOP]
+    names = [name for name in top if all((name, scene) in ends for scene in scenes)]
     told = [[VARIANTS[name].label, *(_end(ends[name, scene]) for scene in scenes)] for name in names]
     for program in external:
         theirs = {run["scene"]: run["curve"][-1][1] for run in program["runs"] if run["seed"] == seed}
