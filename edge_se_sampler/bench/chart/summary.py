@@ -101,8 +101,8 @@ def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
 
 
 def rows_of_scenes(runs: list[Run], external: Sequence[dict[str, Any]] = ()) -> tuple[list[str], list[list[str]]]:
-    """Of methods and scorings, and other programs, that were trained on all scenes with one seed, the least: PSNR at the end
-    on each, in brackets where nothing was learnt, as far as that is known. No rows where there is one scene."""
+    """Of methods and scorings, and other programs, that were trained on all scenes with one seed, the least: PSNR at
+    the end on each, in brackets where nothing was learnt, as far as that is known. No rows where there is one scene."""
     scenes, seed = scenes_of(runs), min(run["seed"] for run in runs)
     ends = {(run["variant"], run["scene"]): run for run in runs if run["seed"] == seed}
     top = [name for name, variant in VARIANTS.items() if variant.group in TOP]
