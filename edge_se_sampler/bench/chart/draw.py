@@ -163,5 +163,6 @@ def _finish(axis: Any, label: str) -> None:
     axis.set(xscale="log", xlabel=label)
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.set_xticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
+    marks = [mark for mark in (1, 3, 10, 30, 100) if mark < 2 * axis.dataLim.x1]
+    axis.set_xticks(marks, [str(mark) for mark in marks])
     axis.minorticks_off()
