@@ -65,12 +65,20 @@ def test_the_readme_quotes_the_committed_results():
     told = f"{times['edge_all_images']:.2f} ms from 100 images, {times['edge_one_image']:.2f} ms from one"
     assert readme_row("4096") == f"{told} (a flat searchsorted: {times['flat_searchsorted']:.2f} ms)"
     assert readme_row("training memory") == f"{bench['training_memory']['ratio']:.3f} x"
-    scoring = result("scoring/result.json")
-    times, ranks = scoring["time_against_random"], scoring["rank_correlation_with_exact"]
-    assert readme_row("SE's step") == (
-        f"{times['exact']:.2f}, {times['coarse']:.2f}, {times['memory']:.2f} x; ranks agree with the exact ones "
-        f"{ranks['coarse']:.2f}, {ranks['memory']:.2f} after {scoring['learning']} steps"
-    )
+    for file, row in (("result", "SE's step"), ("paper", "the paper's network")):
+        scoring = result(f"scoring/{file}.json")
+        times, ranks = scoring["time_against_random"], scoring["rank_correlation_with_exact"]
+        assert readme_row(row) == (
+            f"{times['exact']:.2f}, {times['coarse']:.2f}, {times['memory']:.2f} x; ranks agree with the exact ones "
+            f"{ranks['coarse']:.2f}, {ranks['memory']:.2f} after {scoring['learning']} steps"
+        )
+
+
+def test_cheap_squared_errors_come_at_randoms_price_on_the_papers_network():
+    scoring = result("scoring/paper.json")
+    assert scoring["time_against_random"]["coarse"] <= 1.2
+    assert scoring["time_against_random"]["memory"] <= 1.05
+    assert max(scoring["memory_against_random"][how] for how in ("coarse", "memory")) <= 1.05
 
 
 def test_the_readme_quotes_the_bench_inside_nerfstudio():

@@ -138,7 +138,7 @@ def live_pixels(views: Views, hull: Hull) -> list[np.ndarray]:
 
 
 def _outermost(cells: np.ndarray) -> np.ndarray:
-    """(X, Y, Z) bool: cells with another side than those of cells; what comes in from outside meets one of them."""
+    """(X, Y, Z) bool: cells with one of the 26 around them empty; a ray from outside meets one of these first."""
     inner = np.pad(cells, 1)
     for axis in range(3):
         inner = inner & np.roll(inner, 1, axis) & np.roll(inner, -1, axis)
