@@ -39,7 +39,7 @@ else:
     if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered
         changes, samples = {"early": "edge", "late": "se", "se_scoring": "memory", "early_fraction": 0.3}, {}
     if method == "lean-nerf without alpha":  # where the early phase is decided again, and watched, and cells are split
-        changes, samples = {}, {"cull_by_alpha": False, "cell_pixels": 0.1}
+        changes, samples = {}, {"cull_by_alpha": False, "cell_pixels": 0.4}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **changes)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
     model = replace(config.pipeline.model, **samples)
