@@ -175,3 +175,5 @@ def test_doubled_cells_have_whatever_the_hull_has_and_split_are_the_hull() -> No
     assert splits == 2
     assert first.is_the_same_as(OccupancyGrid.of(hull, 2, 2))
     assert not first.is_the_same_as(OccupancyGrid.of(hull, 2, 1))
+    told = (first.corner, float(first.side), first.hull, 2)
+    assert not first.is_the_same_as(OccupancyGrid(*told, coarser=1))  # of a hull in cells twice as large

@@ -33,13 +33,13 @@ lean.JUDGE_EVERY, lean.LEAST_OPACITY, lean.SOLID = 5, 0.001, 0.0
 if what == "resume":
     trainer = prepare_resume(RunFolder(place))
 else:
-    config = registered_methods()[method.removesuffix(" without alpha")].specification.config
+    config = registered_methods()[method.split()[0]].specification.config
     changes = {"early_fraction": 0.7}
     samples = {"num_coarse_samples": 8, "num_importance_samples": 8, "density_noise": 0.1}
     if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered
         changes, samples = {"early": "edge", "late": "se", "se_scoring": "memory", "early_fraction": 0.3}, {}
-    if method == "lean-nerf without alpha":  # where the early phase is decided again, and watched, and cells are split
-        changes, samples = {}, {"cull_by_alpha": False, "cell_pixels": 0.4}
+    if "without alpha" in method:  # where the early phase is decided again, and watched, and cells are split
+        changes, samples = {}, {"cull_by_alpha": False, "cell_pixels": 0.1 if "twice" in method else 0.4}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **changes)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
     model = replace(config.pipeline.model, **samples)
@@ -100,6 +100,7 @@ def state(run: Path) -> dict[str, bytes | float | str]:
         pytest.param("edge-se-nerf", 16, marks=pytest.mark.slow),  # in the SE phase
         ("lean-nerf", 12),
         ("lean-nerf without alpha", 12),
+        pytest.param("lean-nerf without alpha, split twice", 12, marks=pytest.mark.slow),
     ],
 )
 def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, interrupt_at: int):

@@ -111,7 +111,8 @@ class OccupancyGrid(nn.Module):
     def is_the_same_as(self, other: OccupancyGrid) -> bool:
         """Whether both have the same cells, split as often."""
         told = ("corner", "side", "hull", "splits")
-        return all(torch.equal(getattr(self, key).cpu(), getattr(other, key).cpu()) for key in told)
+        same = self.occupied.shape == other.occupied.shape
+        return same and all(torch.equal(getattr(self, key).cpu(), getattr(other, key).cpu()) for key in told)
 
     def split(self) -> None:
         """Halve all cells along every axis."""
