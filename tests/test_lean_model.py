@@ -333,6 +333,10 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
     assert said["sampling"].startswith("uniform")
+    wave = 2 * np.pi * float(told.grid().reach) / 2**5 / told.footprint
+    assert wave > 2  # pixels: no more than the cameras resolve
+    assert said["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
+    assert said["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
     large = needs(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))

@@ -10,7 +10,7 @@ from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.edges import unit_float
-from edge_se_sampler.nerf.config import LeanModelConfig
+from edge_se_sampler.nerf.config import LeanModelConfig, preset_of, resolved, size_for
 from edge_se_sampler.nerf.economy import Needs, live_pixels, needs, spread_pixels
 from edge_se_sampler.nerf.occupancy import OccupancyGrid
 from edge_se_sampler.show import require_pyplot, save_figure
@@ -52,6 +52,10 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
     distance = np.linalg.norm(views.camera_to_worlds[:, :, 3] - box.middle, axis=1)
     at = ", ".join(f"{value + 0.0:.2f}" for value in box.middle.round(2))
     across = np.mean(np.concatenate([pixels.ravel() for pixels in live]))
+    size = size_for(max(max(size) for size in sizes))
+    preset = preset_of(config, size)
+    model = resolved(config, size, preset.rays)
+    wave = 2 * np.pi * float(told.grid().reach) / 2 ** ((model.position_frequencies or 1) - 1) / told.footprint
     said = {
         "views": f"{len(views.images)} of {' and '.join(f'{w} x {h}' for w, h in sizes)}, {np.median(distance):.2f} "
         f"from what they look at, ({at})",
@@ -61,6 +65,10 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
         "cells": f"{hull.side:.4f} a side, {hull.side / told.footprint:.1f} pixels; {hull.cells.sum():,} of "
         f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)"
         + (f"; training begins with {first:.4f}, split to {finest:.4f} where it sees any" if told.splits else ""),
+        "encoding": f"{model.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; what "
+        f"is finer is left to {model.features} features at every corner of a cell",
+        "network": f"{model.depth} x {model.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size {size}, "
+        "by the images' longer side",
         "rays": f"{100 * across:.1f} % of the pixels may cross them; such a ray has {samples:.1f} samples, {along:.0f} "
         "along all of its depth",
         "sampling": "uniform among them"

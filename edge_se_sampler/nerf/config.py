@@ -130,7 +130,7 @@ SIZES: dict[str, SizePreset[NeRFModelConfig]] = {
 
 
 def _lean(size: Any, rays: int, iterations: int) -> SizePreset[LeanModelConfig]:
-    shape = LeanModelConfig(size, width=64, depth=1, position_frequencies=4, direction_frequencies=2)
+    shape = LeanModelConfig(size, width=64, depth=1, position_frequencies=6, direction_frequencies=2)
     return SizePreset(shape, 6e-3, rays, iterations)
 
 

@@ -17,9 +17,6 @@ from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
 
 Run = dict[str, Any]
 RECOMMENDED = "lean"
-BY_CHANCE = 0.1
-"""dB by which one training, repeated with the same seed, may differ, for its steps take as long as the machine lets
-them: lean-nerf on bricks, twice with seed 0, has 33.21 and 33.33 dB after 20 CPU seconds."""
 TOP: tuple[Group, ...] = ("methods", "scorings")
 """Kinds of variants on the chart itself; the others are parts of the recommended method."""
 
@@ -75,14 +72,13 @@ def front(runs: list[Run]) -> list[dict[str, Any]]:
 
 
 def dominating(runs: list[Run]) -> list[str]:
-    """Variants better than the recommended one, by more than chance, at every look that both have: with one, it is off
-    the front."""
+    """Variants better than the recommended one at every look that both have: with one, it is off the front."""
     told = []
     for name in {run["variant"] for run in runs} - {RECOMMENDED}:
         both = comparable([run for run in runs if run["variant"] in (name, RECOMMENDED)])
         pairs = [(over_scenes(both[RECOMMENDED], look), over_scenes(both[name], look)) for look in LOOKS]
         known = [(ours, theirs) for ours, theirs in pairs if ours is not None and theirs is not None]
-        if known and all(theirs > ours + BY_CHANCE for ours, theirs in known):
+        if known and all(theirs > ours for ours, theirs in known):
             told.append(name)
     return sorted(told)
 

@@ -69,10 +69,8 @@ VARIANTS: dict[str, Variant] = {
     "no-density": Variant("economy", "no density culling", changes={f"{MODEL}.cull_by_density": False}),
     "economy-off": Variant("economy", "economy off", changes={f"{MODEL}.economy": "off"}),
     "no-features": Variant(
-        "economy", "no features: 4 x 96 network, 6 frequencies",
-        changes={
-            f"{MODEL}.features": 0, f"{MODEL}.depth": 4, f"{MODEL}.width": 96, f"{MODEL}.position_frequencies": 6,
-        },
+        "economy", "no features: 4 x 96 network",
+        changes={f"{MODEL}.features": 0, f"{MODEL}.depth": 4, f"{MODEL}.width": 96},
     ),
     "two-networks": Variant(
         "economy", "coarse and fine network in the hull", "vanilla-nerf",
@@ -86,7 +84,8 @@ VARIANTS: dict[str, Variant] = {
     "features-4": Variant("size", "4 features", changes={f"{MODEL}.features": 4}),
     "features-16": Variant("size", "16 features", changes={f"{MODEL}.features": 16}),
     "frequencies-0": Variant("size", "position as it is", changes={f"{MODEL}.position_frequencies": 0}),
-    "frequencies-6": Variant("size", "6 frequencies", changes={f"{MODEL}.position_frequencies": 6}),
+    "frequencies-4": Variant("size", "4 frequencies", changes={f"{MODEL}.position_frequencies": 4}),
+    "frequencies-8": Variant("size", "8 frequencies", changes={f"{MODEL}.position_frequencies": 8}),
     "cells-0.7": Variant("size", "cells of 0.7 pixels", changes={f"{MODEL}.cell_pixels": 0.7}),
     "cells-1.6": Variant("size", "cells of 1.6 pixels", changes={f"{MODEL}.cell_pixels": 1.6}),
     "steps-1.5": Variant("size", "steps of 1.5 cells", changes={f"{MODEL}.step_cells": 1.5}),
