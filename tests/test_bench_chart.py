@@ -148,7 +148,12 @@ def test_the_front_names_the_best_at_every_look_and_how_far_the_recommended_one_
 
 def test_who_is_better_all_the_time_keeps_the_recommended_one_off_the_front() -> None:
     mine = run_of("lean", "mic", 0, [(1, 20), (7, 25), (60, 30)])
-    for psnrs, expected in (((21, 26, 31), ["edge"]), ((21, 26, 30), []), ((21, 24, 31), []), ((20.1, 25.1, 30.1), ["edge"])):
+    for psnrs, expected in (
+        ((21, 26, 31), ["edge"]),
+        ((21, 26, 30), []),
+        ((21, 24, 31), []),
+        ((20.1, 25.1, 30.1), ["edge"]),
+    ):
         theirs = run_of("edge", "mic", 0, list(zip((1, 7, 60), psnrs, strict=True)))
         assert dominating([mine, theirs]) == expected
 
