@@ -65,10 +65,10 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
         "cells": f"{hull.side:.4f} a side, {hull.side / told.footprint:.1f} pixels; {hull.cells.sum():,} of "
         f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)"
         + (f"; training begins with {first:.4f}, split to {finest:.4f} where it sees any" if told.splits else ""),
-        "encoding": f"{model.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; what "
-        f"is finer is left to {model.features} features at every corner of a cell",
-        "network": f"{model.depth} x {model.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size {size}, "
-        "by the images' longer side",
+        "encoding": f"{model.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; "
+        f"what is finer is left to {model.features} features at every corner of a cell",
+        "network": f"{model.depth} x {model.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size "
+        f"{size}, by the images' longer side",
         "rays": f"{100 * across:.1f} % of the pixels may cross them; such a ray has {samples:.1f} samples, {along:.0f} "
         "along all of its depth",
         "sampling": "uniform among them"
