@@ -23,7 +23,7 @@ from edge_se_sampler.bench.chart.summary import (
     rows_of_scenes,
 )
 from edge_se_sampler.bench.chart.train import LOOKS
-from edge_se_sampler.bench.chart.variant import VARIANTS
+from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS
 from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, Cell, run_cell
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.scenes import made_scenes
@@ -209,7 +209,7 @@ def test_the_readme_quotes_the_chart():
     told = result("chart/result.json")
     head, rows = rows_of(told["runs"])
     shown = head.index("failed") + 1
-    for group in ("methods", "scorings", "sampling", "economy"):
+    for group in GROUPS:
         assert all(in_readme(row[:shown]) for row in rows[group]), group
     for name, _, _, *psnrs in rows_of_others(told["runs"], told["external"]):
         assert in_readme([name, *psnrs, ""]), name
@@ -273,12 +273,11 @@ def test_the_readme_says_what_edges_and_split_cells_are_worth_without_a_hull():
     assert f"worth {ended('no-hull', 'bricks') - ended('economy-off', 'bricks'):.1f} dB" in text
 
 
-def test_every_method_is_on_the_chart_with_three_seeds():
+def test_every_variant_is_on_the_chart_with_three_seeds():
     told = result("chart/result.json")
-    for name, variant in VARIANTS.items():
-        if variant.group in ("methods", "scorings"):
-            runs = [run for run in told["runs"] if (run["variant"], run["scene"]) == (name, "bricks")]
-            assert sorted(run["seed"] for run in runs) == [0, 1, 2], name
+    for name in VARIANTS:
+        runs = [run for run in told["runs"] if (run["variant"], run["scene"]) == (name, "bricks")]
+        assert sorted(run["seed"] for run in runs) == [0, 1, 2], name
 
 
 def test_the_readme_says_what_six_frequencies_are_worth():
@@ -294,20 +293,15 @@ def test_the_readme_says_what_six_frequencies_are_worth():
 
 
 def test_the_readme_says_which_sizes_are_ahead_when():
-    runs = [run for run in result("chart/result.json")["runs"] if (run["scene"], run["seed"]) == ("bricks", 0)]
-    mine = [run for run in runs if run["variant"] == "lean"]
-    ahead = {
-        name: [
-            (over_scenes([run for run in runs if run["variant"] == name], seconds) or 0)
-            - (over_scenes(mine, seconds) or 0)
-            for seconds in (3, 60)
-        ]
-        for name, variant in VARIANTS.items()
-        if variant.group == "size"
-    }
-    assert all(ahead[name][0] > 0 > ahead[name][1] for name in ("width-32", "cells-1.6", "steps-1.5"))
-    assert all(ahead[name][0] < 0 < ahead[name][1] < 0.1 for name in ("width-128", "features-4"))
-    assert max(ahead["cells-0.7"]) < 0
+    runs = [run for run in result("chart/result.json")["runs"] if run["scene"] == "bricks"]
+
+    def ahead(name: str, seconds: float) -> float:
+        ours, theirs = ([run for run in runs if run["variant"] == which] for which in ("lean", name))
+        return (over_scenes(theirs, seconds) or 0) - (over_scenes(ours, seconds) or 0)
+
+    assert all(ahead(name, 3) > 0 > ahead(name, 100) for name in ("width-32", "cells-1.6", "steps-1.5"))
+    assert all(ahead(name, 3) < 0 < ahead(name, 100) < 0.1 for name in ("width-128", "features-16", "frequencies-8"))
+    assert all(ahead(name, look) < 0 for name in ("cells-0.7", "depth-2", "rays-128") for look in (3, 7, 20, 60))
 
 
 def test_lean_nerf_is_on_the_committed_charts_front():
