@@ -17,8 +17,8 @@ import tyro
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf.config import LeanModelConfig, check_fineness
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.models.config import LeanModelConfig, check_fineness
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Scenes:
     """Of the training and validation poses."""
 
     def run(self) -> None:
-        from edge_se_sampler.data.made.folder import make_scenes
+        from edge_se_sampler.data.synthetic.folder import make_scenes
         from edge_se_sampler.engine.progress import Progress
 
         progress = Progress(len(self.names) * (self.num_train + self.num_val + self.num_test), "rendering scenes")
@@ -200,7 +200,7 @@ class Show:
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender
         from edge_se_sampler.engine.files import check_output
-        from edge_se_sampler.show import show
+        from edge_se_sampler.engine.show import show
 
         if self.num_views < 1:
             raise InputError(f"--num-views is {self.num_views}: must be at least 1")

@@ -13,9 +13,9 @@ from importlib.metadata import entry_points
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig
-from edge_se_sampler.nerf.config import InfoNeRFModelConfig, LeanModelConfig, NeRFModelConfig
+from edge_se_sampler.models.config import InfoNeRFModelConfig, LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.protocol import MethodSpecification
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 ENTRY_POINT_GROUP = "edge_se_sampler.method_configs"
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 SAME = [(9, 14)] * 3
 MIXED = [(9, 14), (20, 6), (5, 5)]

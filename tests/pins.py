@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from batches import LATE, MIXED, SAME, batch_of, following, half_masks
 
-from edge_se_sampler.data.made import make_scenes
+from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, prepare
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.streams import Stream, stream
+from edge_se_sampler.sampling.random_streams import Stream, stream
 
 PINS = Path(__file__).with_name("pins.json")
 STEPS = 300

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench.chart import beside
-from edge_se_sampler.bench.chart.beside import Clock, Scale, Task, TimeIsUp, mean_psnr, train
-from edge_se_sampler.bench.chart.external import read_external
-from edge_se_sampler.bench.chart.step import bench_step
-from edge_se_sampler.data.made import make_scenes
+from edge_se_sampler.bench.baselines import run as beside
+from edge_se_sampler.bench.baselines.results import read_external
+from edge_se_sampler.bench.baselines.run import Clock, Scale, Task, TimeIsUp, mean_psnr, train
+from edge_se_sampler.bench.baselines.step import bench_step
+from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.errors import InputError
 
 NERF_PYTORCH = """

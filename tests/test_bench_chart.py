@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge_se_sampler.bench.baselines.results import read_external
 from edge_se_sampler.bench.chart import train as train_module
 from edge_se_sampler.bench.chart.draw import draw_chart, draw_scenes
-from edge_se_sampler.bench.chart.external import read_external
 from edge_se_sampler.bench.chart.summary import (
     at,
     beside,
@@ -26,11 +26,11 @@ from edge_se_sampler.bench.chart.summary import (
     table,
 )
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
-from edge_se_sampler.bench.chart.variant import VARIANTS, Cell, cells, changed, config_of
-from edge_se_sampler.bench.experiment import alone
+from edge_se_sampler.bench.chart.variants import VARIANTS, Cell, cells, changed, config_of
+from edge_se_sampler.bench.runner import alone
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.made import make_scenes
-from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.engine.resolve import planned
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 

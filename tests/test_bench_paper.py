@@ -15,20 +15,20 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench import experiment as running
-from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
+from edge_se_sampler.bench import runner as running
+from edge_se_sampler.bench.outcomes import background_measures, foreground_share, outcome
 from edge_se_sampler.bench.paper import estimate
-from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, TABLES, Cell, Preset, cells, config_of, run_cell
 from edge_se_sampler.bench.paper.outputs import keep_view
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES, published
 from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
+from edge_se_sampler.bench.paper.trials import PAPERS, PRESETS, TABLES, Cell, Preset, cells, config_of, run_cell
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.made.folder import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.evaluation import measures, pictures_of
 from edge_se_sampler.engine.run_folder import config_from_json, config_to_json
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf.config import InfoNeRFModelConfig
+from edge_se_sampler.models.config import InfoNeRFModelConfig
 
 SMALL = Preset("tiny", iterations=4, info_iterations=3, rays=16, image_size=16, num_train=11, num_test=1)
 

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from edge_se_sampler.bench import samplers
-from edge_se_sampler.bench.samplers import bench_samplers, build_tables, large_image_halves, table_of
-from edge_se_sampler.distribution import B
+from edge_se_sampler.bench.micro import samplers
+from edge_se_sampler.bench.micro.samplers import bench_samplers, build_tables, large_image_halves, table_of
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.sampling.distribution import B
 
 
 def test_tables_cost_what_their_docstring_says() -> None:

@@ -9,11 +9,12 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench import experiment
-from edge_se_sampler.bench.paper.cell import PRESETS, Preset
-from edge_se_sampler.bench.schedule import cell as cell_module
+from edge_se_sampler.bench import runner as experiment
+from edge_se_sampler.bench.paper.trials import PRESETS, Preset
 from edge_se_sampler.bench.schedule import summary as summary_module
-from edge_se_sampler.bench.schedule.cell import (
+from edge_se_sampler.bench.schedule import trials as cell_module
+from edge_se_sampler.bench.schedule.summary import best_shares, failures, lengths, table
+from edge_se_sampler.bench.schedule.trials import (
     FRACTIONS,
     OF_LENGTHS,
     Cell,
@@ -24,7 +25,6 @@ from edge_se_sampler.bench.schedule.cell import (
     length_cells,
     settings_of,
 )
-from edge_se_sampler.bench.schedule.summary import best_shares, failures, lengths, table
 
 
 def test_there_are_280_pairs() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench.scoring import spearman
+from edge_se_sampler.bench.micro.scoring import spearman
 
 
 def test_ranks_correlate_whatever_the_scale() -> None:

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from edge_se_sampler.bench import experiment
-from edge_se_sampler.bench.stability import scene
+from edge_se_sampler.bench import runner as experiment
+from edge_se_sampler.bench.stability import scenes as scene
 from edge_se_sampler.bench.stability import train as train_module
-from edge_se_sampler.bench.stability.point import AXES, BASE, PAIRS, STRATEGIES, Cell, Point, cells, points
-from edge_se_sampler.bench.stability.scene import COLORS, SHIFT, behind, views
+from edge_se_sampler.bench.stability.scenes import COLORS, SHIFT, behind, views
+from edge_se_sampler.bench.stability.settings import AXES, BASE, PAIRS, STRATEGIES, Cell, Point, cells, points
 from edge_se_sampler.bench.stability.summary import table, totals
 from edge_se_sampler.bench.stability.train import Measured, Scale, ending, measured, portrait, run_cell, trainer_of
-from edge_se_sampler.edges import edge_strength
-from edge_se_sampler.engine.revival import dead_networks
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.engine.reinitialization import dead_networks
+from edge_se_sampler.models.nerf import NeRFModel
+from edge_se_sampler.sampling.edges import edge_strength
 
 SMALL = Scale(iterations=4, rays=8, width=8, samples=4)
 

@@ -10,7 +10,7 @@ import pytest
 
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.paper.tables import markdown, rows_of
-from edge_se_sampler.bench.paper.verdict import verdicts
+from edge_se_sampler.bench.paper.verdicts import verdicts
 from edge_se_sampler.bench.statistics import paired_difference, t_quantile, wilson
 
 

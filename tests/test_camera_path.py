@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from tiny import tiny_views
 
-from edge_se_sampler.cameras import RayGenerator
+from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.engine.camera_path import spiral
 

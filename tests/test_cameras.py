@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from edge_se_sampler.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
-from edge_se_sampler.data.made import make_scenes
-from edge_se_sampler.data.made.catalogue import made_scene
-from edge_se_sampler.data.made.visibility import NOTHING, nearest_hits
-from edge_se_sampler.nerf.samples import stratified
+from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.visibility import NOTHING, nearest_hits
+from edge_se_sampler.models.ray_samples import stratified
 
 SIZES = [(5, 7), (4, 6), (3, 8)]  # rows, columns
 

@@ -23,14 +23,14 @@ from edge_se_sampler.bench.chart.summary import (
     rows_of_scenes,
 )
 from edge_se_sampler.bench.chart.train import LOOKS
-from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS
-from edge_se_sampler.bench.paper.cell import PAPERS, PRESETS, Cell, run_cell
+from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.scenes import made_scenes
 from edge_se_sampler.bench.paper.tables import alike
-from edge_se_sampler.bench.paper.verdict import failed, verdicts
+from edge_se_sampler.bench.paper.trials import PAPERS, PRESETS, Cell, run_cell
+from edge_se_sampler.bench.paper.verdicts import failed, verdicts
 from edge_se_sampler.bench.schedule.summary import MARGIN, failures, lengths
-from edge_se_sampler.bench.stability.point import STRATEGIES as MAP_STRATEGIES
+from edge_se_sampler.bench.stability.settings import STRATEGIES as MAP_STRATEGIES
 from edge_se_sampler.bench.stability.summary import totals
 
 ROOT = Path(__file__).parent.parent

@@ -11,12 +11,12 @@ import pytest
 import torch
 from tiny import tiny_model, tiny_views
 
-from edge_se_sampler.cameras import RayGenerator
+from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.data.datamanager import VanillaDataManager, cameras_of, image_batch, unit_interval
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import PixelSampler, PixelSamplerConfig
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 VIEWS = tiny_views(3, 8, 6)
 

@@ -11,8 +11,8 @@ import torch
 from goodness import ALPHA, p_value, pixel_counts
 from torch import Tensor
 
-from edge_se_sampler.distribution import FULL, B, PixelTable
-from edge_se_sampler.edges import edge_strength
+from edge_se_sampler.sampling.distribution import FULL, B, PixelTable
+from edge_se_sampler.sampling.edges import edge_strength
 
 QUANTUM = 2 / FULL
 """Probabilities are exact to twice 1 / FULL: a share of the block, a share of the superblock."""

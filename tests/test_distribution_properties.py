@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_se_sampler.distribution import FULL, PixelTable
+from edge_se_sampler.sampling.distribution import FULL, PixelTable
 
 QUANTUM = 2 / FULL
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.edges import CANNY_THRESHOLDS, FILTERS, edge_strength, luma, unit_float
+from edge_se_sampler.sampling.edges import CANNY_THRESHOLDS, FILTERS, edge_strength, luma, unit_float
 
 SHAPES = [(1, 1), (1, 7), (7, 1), (2, 2), (3, 3), (5, 8), (33, 17)]
 SOURCES = ("color", "alpha", "both")

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from edge_se_sampler.nerf.encoding import encoded_size, positional_encoding
+from edge_se_sampler.models.encoding import encoded_size, positional_encoding
 
 
 @pytest.mark.parametrize(("frequencies", "size"), [(10, 63), (4, 27), (0, 3)])

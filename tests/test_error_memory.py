@@ -10,9 +10,9 @@ import torch
 from batches import LATE, MIXED, NUMBERS, SAME, batch_of, brightness, following, half_masks
 from torch import Tensor
 
-from edge_se_sampler import error_memory
-from edge_se_sampler.error_memory import FADES, ErrorMemory
-from edge_se_sampler.schedule import Watch
+from edge_se_sampler.sampling import error_map
+from edge_se_sampler.sampling.error_map import FADES, ErrorMemory
+from edge_se_sampler.sampling.schedule import Watch
 
 EVERY = [(number, row, column) for number, size in zip(NUMBERS, MIXED, strict=True) for row, column in np.ndindex(size)]
 
@@ -69,7 +69,7 @@ def test_what_was_never_seen_is_taken_to_be_usual() -> None:
 
 
 def test_many_pixels_share_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(error_memory, "MOST_BLOCKS", 60)
+    monkeypatch.setattr(error_map, "MOST_BLOCKS", 60)
     memory = memory_of()
     assert memory.side == 3
     assert len(memory) == 3 * 5 + 7 * 2 + 2 * 2
@@ -86,7 +86,7 @@ def test_images_that_come_later_do_not_disturb_the_others(monkeypatch: pytest.Mo
     memory.note(np.array([[7, 3, 3]]), np.array([2.0]), 0)
     memory.add({3: (20, 6), 7: (9, 14)})
     assert memory.recall(np.array([[7, 3, 3]]), 0, 0) == pytest.approx(2)
-    monkeypatch.setattr(error_memory, "MOST_BLOCKS", 60)
+    monkeypatch.setattr(error_map, "MOST_BLOCKS", 60)
     memory.add({11: (5, 5)})  # blocks have to grow
     assert len(memory) < 60
     assert memory.recall(np.array([[7, 3, 3]]), 0, 0) == pytest.approx(0)

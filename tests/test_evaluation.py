@@ -14,8 +14,8 @@ import torch
 from tiny import tiny_config, tiny_views, with_constant_density
 from torch import Tensor
 
-from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.engine.evaluation import (
     Picture,
@@ -28,8 +28,8 @@ from edge_se_sampler.engine.evaluation import (
     ssim,
     target_image,
 )
-from edge_se_sampler.nerf import model as model_module
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.models import nerf as model_module
+from edge_se_sampler.models.nerf import NeRFModel
 
 HEIGHT, WIDTH = 20, 24
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from edge_se_sampler.nerf.feature_grid import FeatureGrid
-from edge_se_sampler.nerf.hull import Hull
-from edge_se_sampler.nerf.occupancy import OccupancyGrid, halved
+from edge_se_sampler.occupancy.features import FeatureGrid
+from edge_se_sampler.occupancy.grid import OccupancyGrid, halved
+from edge_se_sampler.occupancy.hull import Hull
 
 SIDE = 0.5
 

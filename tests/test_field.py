@@ -11,9 +11,9 @@ import torch
 from tiny import tiny_config
 from torch import Tensor, nn
 
-from edge_se_sampler.nerf.config import SIZES, NeRFModelConfig, resolved
-from edge_se_sampler.nerf.field import NeRFField
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.models.config import SIZES, NeRFModelConfig, resolved
+from edge_se_sampler.models.field import NeRFField
+from edge_se_sampler.models.nerf import NeRFModel
 
 PAPER = SIZES["paper"].model
 

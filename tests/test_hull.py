@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import torch
 
-from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
-from edge_se_sampler.data.made.cameras import poses
+from edge_se_sampler.data.synthetic.cameras import poses
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf import economy
-from edge_se_sampler.nerf import hull as hull_module
-from edge_se_sampler.nerf.config import LeanModelConfig, NeRFModelConfig
-from edge_se_sampler.nerf.economy import MOST_PLACES, live_pixels, needs, spread_pixels
-from edge_se_sampler.nerf.hull import (
+from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig
+from edge_se_sampler.occupancy import hull as hull_module
+from edge_se_sampler.occupancy import scene_analysis as economy
+from edge_se_sampler.occupancy.grid import MOST_CELLS, OccupancyGrid
+from edge_se_sampler.occupancy.hull import (
     AHEAD,
     AROUND,
     BEHIND,
@@ -32,7 +32,7 @@ from edge_se_sampler.nerf.hull import (
     projected,
     silhouettes,
 )  # fmt: skip
-from edge_se_sampler.nerf.occupancy import MOST_CELLS, OccupancyGrid
+from edge_se_sampler.occupancy.scene_analysis import MOST_PLACES, live_pixels, needs, spread_pixels
 
 VIEWS = 12
 

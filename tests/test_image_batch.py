@@ -9,7 +9,7 @@ import pytest
 import torch
 from batches import MIXED, NUMBERS, SAME, batch_of, half_masks, picture
 
-from edge_se_sampler.image_batch import ImageBatch
+from edge_se_sampler.sampling.image_batch import ImageBatch
 
 SOME = torch.tensor([[2, 4, 3], [0, 8, 5], [1, 0, 0], [2, 0, 4], [0, 8, 5]])
 

@@ -11,7 +11,7 @@ from batches import LATE, MIXED, NUMBERS, SAME, batch_of, brightness, following,
 from goodness import mean_is
 from torch import Tensor
 
-from edge_se_sampler.edges import edge_strength
+from edge_se_sampler.sampling.edges import edge_strength
 
 
 def batch_with_loss(sizes: Any, masks: list[Tensor]) -> dict[str, Any]:

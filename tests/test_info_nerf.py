@@ -15,18 +15,18 @@ import torch
 from tiny import SMALL, tiny_config, tiny_rays, tiny_views
 from torch import Tensor
 
-from edge_se_sampler.cameras import Cameras, RayBundle
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.data.made.cameras import poses
+from edge_se_sampler.data.synthetic.cameras import poses
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.resolve import planned
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf.config import InfoNeRFModelConfig
-from edge_se_sampler.nerf.info import InfoNeRFModel, information_gain, ray_entropy, turn, turned
-from edge_se_sampler.nerf.volume import opacity
+from edge_se_sampler.models.config import InfoNeRFModelConfig
+from edge_se_sampler.models.infonerf import InfoNeRFModel, information_gain, ray_entropy, turn, turned
+from edge_se_sampler.models.rendering import opacity
 
 HIT = torch.ones(1, 1).double()
 

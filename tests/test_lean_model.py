@@ -14,9 +14,9 @@ import torch
 from tiny import cells, check_gradients, judged, tiny_model, tiny_rays
 from torch import Tensor
 
-from edge_se_sampler.bench.chart.variant import SAMPLER, changed
+from edge_se_sampler.bench.chart.variants import SAMPLER, changed
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.made import make_scenes
+from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
 from edge_se_sampler.engine.inspection import inspect
@@ -24,12 +24,12 @@ from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, prepare, summary
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf import lean
-from edge_se_sampler.nerf.config import LeanModelConfig
-from edge_se_sampler.nerf.economy import live_pixels, needs
-from edge_se_sampler.nerf.hull import Hull
-from edge_se_sampler.nerf.lean import JUDGE_EVERY, LeanModel
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.models import lean
+from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.lean import JUDGE_EVERY, LeanModel
+from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.hull import Hull
+from edge_se_sampler.occupancy.scene_analysis import live_pixels, needs
 
 RAYS = 12
 JUDGE_FROM = 2 * JUDGE_EVERY

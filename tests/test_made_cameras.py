@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.made import SCENE_NAMES
-from edge_se_sampler.data.made.cameras import DISTANCE, Placement, Split, framing, poses
-from edge_se_sampler.data.made.catalogue import made_scene
-from edge_se_sampler.data.made.render import render
-from edge_se_sampler.data.made.scene import Material, SceneBuilder
+from edge_se_sampler.data.synthetic import SCENE_NAMES
+from edge_se_sampler.data.synthetic.cameras import DISTANCE, Placement, Split, framing, poses
+from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.render import render
+from edge_se_sampler.data.synthetic.scene import Material, SceneBuilder
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 OFFSET = (0.2, -0.15)

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.made import SCENE_NAMES, render_view
-from edge_se_sampler.data.made.cameras import DISTANCE, Camera, framing, poses
-from edge_se_sampler.data.made.catalogue import made_scene
-from edge_se_sampler.data.made.linear import inverse_affine, rotation, unit
-from edge_se_sampler.data.made.render import SAMPLES_PER_AXIS, render
-from edge_se_sampler.data.made.scene import BALL_RADIUS, Material, Scene, SceneBuilder
-from edge_se_sampler.data.made.solids import Kind, hit_distance, outward_normals
-from edge_se_sampler.data.made.visibility import KEY_DIRECTION, first_hits, in_shadow, nearest_hits
+from edge_se_sampler.data.synthetic import SCENE_NAMES, render_view
+from edge_se_sampler.data.synthetic.cameras import DISTANCE, Camera, framing, poses
+from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.linear import inverse_affine, rotation, unit
+from edge_se_sampler.data.synthetic.render import SAMPLES_PER_AXIS, render
+from edge_se_sampler.data.synthetic.scene import BALL_RADIUS, Material, Scene, SceneBuilder
+from edge_se_sampler.data.synthetic.solids import Kind, hit_distance, outward_normals
+from edge_se_sampler.data.synthetic.visibility import KEY_DIRECTION, first_hits, in_shadow, nearest_hits
 
 OFFSET = (0.2, -0.15)
 

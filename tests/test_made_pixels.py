@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.made import SCENE_NAMES
-from edge_se_sampler.data.made.cameras import framing, poses
-from edge_se_sampler.data.made.catalogue import made_scene
-from edge_se_sampler.data.made.linear import unit
-from edge_se_sampler.data.made.render import render
-from edge_se_sampler.data.made.shading import radiance
-from edge_se_sampler.data.made.visibility import first_hits
+from edge_se_sampler.data.synthetic import SCENE_NAMES
+from edge_se_sampler.data.synthetic.cameras import framing, poses
+from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.linear import unit
+from edge_se_sampler.data.synthetic.render import render
+from edge_se_sampler.data.synthetic.shading import radiance
+from edge_se_sampler.data.synthetic.visibility import first_hits
 
 # sha256 of the pixels of one 32 x 32 view. A change here changes every made picture that anyone has.
 PIXELS = {
@@ -82,6 +82,6 @@ def test_pixels_do_not_depend_on_the_cpu() -> None:
 
 
 def test_importing_needs_no_torch() -> None:
-    code = "import sys, edge_se_sampler.data.made; print({'torch', 'cv2', 'matplotlib'} & set(sys.modules))"
+    code = "import sys, edge_se_sampler.data.synthetic; print({'torch', 'cv2', 'matplotlib'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 def test_the_six_strategies_of_the_paper_and_two_on_its_other_method():

@@ -12,9 +12,9 @@ import torch
 from tiny import check_gradients, tiny_model, tiny_rays, with_constant_density
 from torch import Tensor, nn
 
-from edge_se_sampler.cameras import RayBundle
-from edge_se_sampler.nerf.model import NeRFModel
-from edge_se_sampler.nerf.ray_model import target_colors
+from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.models.nerf import NeRFModel
+from edge_se_sampler.models.ray_model import target_colors
 
 RAYS = 9
 OUTPUTS = ("rgb_coarse", "rgb_fine", "accumulation_coarse", "accumulation_fine", "depth_fine")

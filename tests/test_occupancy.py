@@ -8,8 +8,8 @@ import torch
 from tiny import tiny_rays
 from torch import Tensor
 
-from edge_se_sampler.nerf.hull import Hull
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.hull import Hull
 
 SIDE = 0.25
 

@@ -15,8 +15,8 @@ from blender_folder import ANGLE, HEIGHT, WIDTH, pixels, write_json, write_scene
 from test_cli_bad_input import refused
 
 from edge_se_sampler.data.blender import SPLITS, Split, read_blender
-from edge_se_sampler.data.made import make_scenes
 from edge_se_sampler.data.offcenter import offcenter
+from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.errors import InputError
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from edge_se_sampler.nerf.packed import render_packed, spread, sum_rays, transmittance
-from edge_se_sampler.nerf.volume import composite, sample_weights
+from edge_se_sampler.models.packed_rendering import render_packed, spread, sum_rays, transmittance
+from edge_se_sampler.models.rendering import composite, sample_weights
 
 STEP = 0.13
 

@@ -9,8 +9,8 @@ import torch
 from batches import NUMBERS, SAME, batch_of, brightness, following
 
 from edge_se_sampler.methods import STRATEGIES
-from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 def in_box(indices: torch.Tensor) -> bool:

@@ -12,12 +12,12 @@ import torch
 from batches import LATE, MIXED, NUMBERS, SAME, batch_of, brightness, following, half_masks
 from goodness import ALPHA, p_value, pixel_counts
 
-from edge_se_sampler.distribution import PixelTable
-from edge_se_sampler.edges import edge_strength
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.image_batch import ImageBatch
-from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.distribution import PixelTable
+from edge_se_sampler.sampling.edges import edge_strength
+from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 PHASES = {
     "uniform": {"step": 0, "early": "uniform"},

@@ -12,9 +12,9 @@ from tiny import tiny_views
 
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.resolve import planned
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf.config import NeRFModelConfig
+from edge_se_sampler.models.config import NeRFModelConfig
 
 NAN, INF = float("nan"), float("inf")
 

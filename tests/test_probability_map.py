@@ -8,8 +8,8 @@ import torch
 from batches import MIXED, batch_of, following, half_masks
 from goodness import ALPHA, p_value, pixel_counts
 
-from edge_se_sampler.image_batch import ImageBatch
-from edge_se_sampler.show import probability_map
+from edge_se_sampler.engine.show import probability_map
+from edge_se_sampler.sampling.image_batch import ImageBatch
 
 
 @pytest.mark.parametrize("strategy", ["uniform", "precrop", "edge"])

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import pytest
 
-from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.protocol import (
     InstantiateConfig,
     PixelSampler,
@@ -15,7 +14,8 @@ from edge_se_sampler.protocol import (
     TrainingCallback,
     TrainingCallbackLocation,
 )
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 class Foreign(PixelSampler):
@@ -38,7 +38,7 @@ def test_setup_builds_the_target_from_the_config_and_what_it_is_given() -> None:
 
 
 def test_setup_imports_a_target_that_is_named() -> None:
-    assert EdgeSEPixelSamplerConfig._target == "edge_se_sampler.pixel_sampler:EdgeSEPixelSampler"
+    assert EdgeSEPixelSamplerConfig._target == "edge_se_sampler.sampling.pixel_sampler:EdgeSEPixelSampler"
     assert type(EdgeSEPixelSamplerConfig().setup()) is EdgeSEPixelSampler
 
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 from goodness import ALPHA, mean_is, p_value
 
-from edge_se_sampler import ranking
-from edge_se_sampler.ranking import error_ranks, keep_by_rank
+from edge_se_sampler.sampling import ranking
+from edge_se_sampler.sampling.ranking import error_ranks, keep_by_rank
 
 Ranking = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 

@@ -24,7 +24,7 @@ from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import prepare, prepare_resume
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf import lean
+from edge_se_sampler.models import lean
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
 what, place, data, interrupt_at, method = sys.argv[1:]

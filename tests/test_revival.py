@@ -11,17 +11,17 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_rays, tiny_views
 
-from edge_se_sampler import schedule
-from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.plan import planned
-from edge_se_sampler.engine.revival import PATIENCE, dead_networks
+from edge_se_sampler.engine.reinitialization import PATIENCE, dead_networks
+from edge_se_sampler.engine.resolve import planned
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import STRATEGIES, registered_methods
-from edge_se_sampler.nerf.model import NeRFModel
+from edge_se_sampler.models.nerf import NeRFModel
+from edge_se_sampler.sampling import schedule
 
 VIEWS = tiny_views(3, 12, 12)
 

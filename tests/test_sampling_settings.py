@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig, SamplingSettings
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig, SamplingSettings
 
 NAN, INF = float("nan"), float("inf")
 

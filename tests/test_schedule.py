@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig, SamplingSettings
-from edge_se_sampler.schedule import phase_at
+from edge_se_sampler.sampling.schedule import phase_at
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig, SamplingSettings
 
 
 @pytest.mark.parametrize(

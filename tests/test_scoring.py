@@ -12,10 +12,10 @@ from tiny import tiny_model, tiny_rays, tiny_views
 from torch import Tensor
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.datamanager import scoring
-from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.protocol import PixelSampler, TrainingCallbackLocation
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.scoring import scoring
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 @pytest.mark.parametrize(("candidates", "rays", "chunks"), [(128, 64, [64, 64]), (130, 64, [64, 64, 2]), (5, 64, [5])])

@@ -15,12 +15,12 @@ from tiny import tiny_views
 
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import image_batch
-from edge_se_sampler.edges import edge_strength
+from edge_se_sampler.engine.show import probability_map, show
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.image_batch import ImageBatch
-from edge_se_sampler.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
-from edge_se_sampler.show import probability_map, show
+from edge_se_sampler.sampling.edges import edge_strength
+from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 HEIGHT, WIDTH = 16, 12
 MASKS = tuple(np.random.default_rng(i).random((HEIGHT, WIDTH)) < share for i, share in enumerate((0.5, 0.1, 0.0)))

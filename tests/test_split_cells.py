@@ -12,11 +12,11 @@ from tiny import cells, judged, tiny_rays
 from torch import Tensor
 
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf import lean
-from edge_se_sampler.nerf.config import LeanModelConfig
-from edge_se_sampler.nerf.hull import Hull
-from edge_se_sampler.nerf.lean import JUDGE_EVERY, SOLID, LeanModel
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
+from edge_se_sampler.models import lean
+from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.lean import JUDGE_EVERY, SOLID, LeanModel
+from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.hull import Hull
 
 RAYS = 12
 SIDE = 0.3

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from edge_se_sampler.streams import Stream, stream
+from edge_se_sampler.sampling.random_streams import Stream, stream
 
 MASK = 2**64 - 1
 

@@ -13,11 +13,11 @@ from tiny import tiny_config, tiny_views
 
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.plan import planned
+from edge_se_sampler.engine.resolve import planned
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer, adam
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf import model as model_module
+from edge_se_sampler.models import nerf as model_module
 
 VIEWS = tiny_views(3, 12, 12)
 RAYS = 37

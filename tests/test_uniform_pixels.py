@@ -12,7 +12,7 @@ import torch
 from goodness import ALPHA, p_value, pixel_counts
 from torch import Tensor
 
-from edge_se_sampler.distribution import UniformPixels
+from edge_se_sampler.sampling.distribution import UniformPixels
 
 SIZES = [(8, 8), (8, 12), (7, 9), (10, 6), (5, 5), (1, 1), (1, 9), (9, 1), (2, 3), (3, 2), (4, 1)]
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from edge_se_sampler.nerf.volume import FAR_AWAY, composite, intervals, sample_weights
+from edge_se_sampler.models.rendering import FAR_AWAY, composite, intervals, sample_weights
 
 BACKGROUND = torch.tensor([0.9, 0.5, 0.1], dtype=torch.float64)
 RED = torch.tensor([0.8, 0.1, 0.2], dtype=torch.float64)

@@ -11,14 +11,14 @@ import pytest
 import torch
 from batches import batch_of, following
 
-from edge_se_sampler.bench.paper.cell import PRESETS
 from edge_se_sampler.bench.paper.scenes import made_scenes
-from edge_se_sampler.bench.schedule.cell import Cell, settings_of
-from edge_se_sampler.bench.trial import trial
-from edge_se_sampler.distribution import PixelTable, UniformPixels
-from edge_se_sampler.image_batch import ImageBatch
-from edge_se_sampler.plain_background import PlainBackgrounds, summed_up
-from edge_se_sampler.schedule import LEARNT, LOST, PAYS_AGAIN, PAYS_NO_MORE, WINDOW_STEPS, Watch
+from edge_se_sampler.bench.paper.trials import PRESETS
+from edge_se_sampler.bench.schedule.trials import Cell, settings_of
+from edge_se_sampler.bench.train import trial
+from edge_se_sampler.sampling.background import PlainBackgrounds, summed_up
+from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels
+from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.schedule import LEARNT, LOST, PAYS_AGAIN, PAYS_NO_MORE, WINDOW_STEPS, Watch
 
 
 def phases(remaining: Any, count: int = 64, noise: float = 0.0, watch: Watch | None = None, gain: float = 1.0) -> Any:

@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import nn
 
-from edge_se_sampler.cameras import RayBundle
 from edge_se_sampler.data.blender import Views
-from edge_se_sampler.nerf.config import NeRFModelConfig
-from edge_se_sampler.nerf.model import NeRFModel
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
-from edge_se_sampler.nerf.ray_model import RayModel
+from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.nerf import NeRFModel
+from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 SMALL = (
     "--max-num-iterations", "6", "--pipeline.datamanager.train-num-rays-per-batch", "16",

@@ -29,7 +29,7 @@ class BenchSamplers:
     """Rounds; the median of each kind of draw is reported."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.samplers import bench_samplers, table_of
+        from edge_se_sampler.bench.micro.samplers import bench_samplers, table_of
         from edge_se_sampler.engine.files import make_room, write_json
 
         if self.output_path is not None:
@@ -63,8 +63,8 @@ class BenchScoring:
     """Iterations before rankings are compared."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.scoring import bench_scoring, scene_in, table_of
-        from edge_se_sampler.data.made.catalogue import ANALOG_OF
+        from edge_se_sampler.bench.micro.scoring import bench_scoring, scene_in, table_of
+        from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
         from edge_se_sampler.engine.files import make_room, write_json
 
         check_known("scene", (self.scene,), ANALOG_OF)
@@ -151,7 +151,7 @@ class _Parallel:
 
     def processes(self) -> int:
         """--workers, checked."""
-        from edge_se_sampler.bench.experiment import default_workers
+        from edge_se_sampler.bench.runner import default_workers
 
         if self.workers is not None and self.workers < 1:
             raise InputError(f"--workers is {self.workers}: give at least one")
@@ -183,14 +183,14 @@ class BenchPaper(_Parallel):
     """Only tell which cells there are and how long they will take; trains nothing, writes nothing."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
-        from edge_se_sampler.bench.paper.cell import PRESETS, TABLES, cells, run_cell
         from edge_se_sampler.bench.paper.estimate import plan_of
         from edge_se_sampler.bench.paper.outputs import keep_view, write_outputs
         from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
         from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
+        from edge_se_sampler.bench.paper.trials import PRESETS, TABLES, cells, run_cell
+        from edge_se_sampler.bench.runner import begun, executor_of, missing, run_cells
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.show import require_pyplot
+        from edge_se_sampler.engine.show import require_pyplot
 
         check_known("tables", self.tables, TABLES)
         check_known("scenes", self.scenes, SCENES)
@@ -248,12 +248,12 @@ class BenchStability(_Parallel):
     """Only tell which points there are, and how much is done; trains nothing, writes nothing."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
-        from edge_se_sampler.bench.stability.point import STRATEGIES, cells, points
+        from edge_se_sampler.bench.runner import begun, executor_of, missing, run_cells
+        from edge_se_sampler.bench.stability.settings import STRATEGIES, cells, points
         from edge_se_sampler.bench.stability.summary import write_outputs
         from edge_se_sampler.bench.stability.train import Scale, run_cell
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.show import require_pyplot
+        from edge_se_sampler.engine.show import require_pyplot
 
         check_known("points", self.points, range(len(points())))
         check_known("strategies", self.strategies, STRATEGIES)
@@ -295,10 +295,11 @@ class BenchSchedule(_Parallel):
     """Of the runs over planned lengths; the fixed length is chosen on others."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
-        from edge_se_sampler.bench.paper.cell import PRESETS
         from edge_se_sampler.bench.paper.scenes import made_scenes
-        from edge_se_sampler.bench.schedule.cell import (
+        from edge_se_sampler.bench.paper.trials import PRESETS
+        from edge_se_sampler.bench.runner import begun, executor_of, run_cells
+        from edge_se_sampler.bench.schedule.summary import best_shares, write_outputs
+        from edge_se_sampler.bench.schedule.trials import (
             LENGTHS,
             Cell,
             Scale,
@@ -308,9 +309,8 @@ class BenchSchedule(_Parallel):
             length_cells,
             run_cell,
         )
-        from edge_se_sampler.bench.schedule.summary import best_shares, write_outputs
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.show import require_pyplot
+        from edge_se_sampler.engine.show import require_pyplot
 
         if not (self.parts and self.failure_seeds and self.length_seeds):
             raise InputError("--parts, --failure-seeds and --length-seeds: give at least one of each")

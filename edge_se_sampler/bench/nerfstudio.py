@@ -25,9 +25,9 @@ from typing import Any
 import torch
 
 from edge_se_sampler.bench.machine import machine, resident_memory
-from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
+from edge_se_sampler.bench.outcomes import background_measures, foreground_share, outcome
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.made.folder import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.evaluation import measures, pictures_of
 from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.progress import Progress

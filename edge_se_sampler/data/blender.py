@@ -12,9 +12,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from edge_se_sampler.data import json_field as field
+from edge_se_sampler.data import json_schema as field
 from edge_se_sampler.data.image_file import ImageFile, read_image
-from edge_se_sampler.data.where import Where, shown
+from edge_se_sampler.data.source_location import Where, shown
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from edge_se_sampler.protocol import InstantiateConfig, PixelSamplerConfig
-from edge_se_sampler.sampling_settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 @dataclass(frozen=True)

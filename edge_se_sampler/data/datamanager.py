@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.datamanager import scoring
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.pixel_sampler import ImportantPixels
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from edge_se_sampler.sampling_settings import SamplingSettings
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
+from edge_se_sampler.sampling.scoring import scoring
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 class VanillaDataManager:

@@ -18,9 +18,9 @@ import numpy as np
 
 from edge_se_sampler.data.blender import SPLITS, Split, Views, has_split, listed_file, read_blender, transforms_path
 from edge_se_sampler.data.canvas import TWINS, Canvas, background, object_pixels
-from edge_se_sampler.data.json_field import Object, load_object
+from edge_se_sampler.data.json_schema import Object, load_object
 from edge_se_sampler.data.new_folder import appearing, check_free
-from edge_se_sampler.data.where import Where, shown
+from edge_se_sampler.data.source_location import Where, shown
 from edge_se_sampler.errors import InputError
 
 Shares = tuple[float, float]  # of an image's width and height

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from edge_se_sampler.cameras import Cameras
+from edge_se_sampler.data.cameras import Cameras
 
 
 def spiral(like: Cameras, count: int) -> Cameras:

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.nerf.config import ModelConfig, NeRFModelConfig
+from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
 from edge_se_sampler.protocol import InstantiateConfig
 
 

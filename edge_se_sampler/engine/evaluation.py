@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import torch
 
-from edge_se_sampler.cameras import RayBundle, RayGenerator
 from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import RayBundle, RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
-from edge_se_sampler.edges import edge_strength, unit_float
-from edge_se_sampler.nerf.ray_model import RayModel, target_colors
+from edge_se_sampler.models.ray_model import RayModel, target_colors
+from edge_se_sampler.sampling.edges import edge_strength, unit_float
 
 EDGE_BAND_SHARE = 0.1
 """The edge band: the share of pixels with the strongest Sobel response, and their neighbours."""

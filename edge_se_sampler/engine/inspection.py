@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_se_sampler.cameras import RayGenerator
 from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
-from edge_se_sampler.edges import unit_float
-from edge_se_sampler.nerf.config import LeanModelConfig, preset_of, resolved, size_for
-from edge_se_sampler.nerf.economy import Needs, live_pixels, needs, spread_pixels
-from edge_se_sampler.nerf.occupancy import OccupancyGrid
-from edge_se_sampler.show import require_pyplot, save_figure
+from edge_se_sampler.engine.show import require_pyplot, save_figure
+from edge_se_sampler.models.config import LeanModelConfig, preset_of, resolved, size_for
+from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.scene_analysis import Needs, live_pixels, needs, spread_pixels
+from edge_se_sampler.sampling.edges import unit_float
 
 RAYS = 4096
 """Looked at, of all live ones."""

@@ -8,10 +8,10 @@ from typing import Any
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.nerf.economy import live_pixels, needs
-from edge_se_sampler.nerf.ray_model import RayModel
-from edge_se_sampler.sampling_settings import SamplingSettings
-from edge_se_sampler.streams import Stream, stream
+from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.occupancy.scene_analysis import live_pixels, needs
+from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 SHADES = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
 """What a sampler takes to be behind the object; a random background has no edge of its own, and counts as white."""

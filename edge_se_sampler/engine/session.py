@@ -15,13 +15,13 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
-from edge_se_sampler.engine.plan import check_seconds, planned
+from edge_se_sampler.engine.resolve import check_seconds, planned
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf.config import ModelConfig, NeRFModelConfig
-from edge_se_sampler.nerf.ray_model import RayModel
-from edge_se_sampler.sampling_settings import SamplingSettings
+from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
+from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 def prepare(config: TrainerConfig) -> Trainer:

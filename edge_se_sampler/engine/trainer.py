@@ -17,13 +17,13 @@ from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.revival import PROBE_RAYS, Revival
+from edge_se_sampler.engine.reinitialization import PROBE_RAYS, Revival
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.tensorboard import EventWriter
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.nerf.info import InfoNeRFModel
+from edge_se_sampler.models.infonerf import InfoNeRFModel
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
-from edge_se_sampler.streams import Stream, stream
+from edge_se_sampler.sampling.random_streams import Stream, stream
 
 
 class Trainer:

@@ -12,12 +12,12 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-from edge_se_sampler.datamanager import scoring
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
 from edge_se_sampler.nerfstudio.planned import planned_steps, remember_watch
 from edge_se_sampler.nerfstudio.scoring import ray_errors, shade_behind, watch_training
-from edge_se_sampler.sampling_settings import SamplingSettings
+from edge_se_sampler.sampling.scoring import scoring
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 class EdgeSEDataManager(VanillaDataManager):

@@ -14,8 +14,8 @@ from typing import Any, Literal
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.pixel_sampler import ImportantPixels
-from edge_se_sampler.sampling_settings import SamplingSettings
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 UNBOUND = (
     "edge-se-sampler: this pixel sampler follows no training run and draws uniformly, as evaluation and export should; "

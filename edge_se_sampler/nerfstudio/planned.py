@@ -15,7 +15,7 @@ from typing import Any
 
 from edge_se_sampler.engine.files import write_json
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.schedule import Watch
+from edge_se_sampler.sampling.schedule import Watch
 
 FILE = "edge-se-plan.json"
 WATCH_FILE = "edge-se-watch.json"

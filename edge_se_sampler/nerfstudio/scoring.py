@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from edge_se_sampler.edges import WHITE
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.pixel_sampler import ImportantPixels
-from edge_se_sampler.schedule import Watch
+from edge_se_sampler.sampling.edges import WHITE
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
+from edge_se_sampler.sampling.schedule import Watch
 
 BLACK = (0.0, 0.0, 0.0)
 HOPELESS_AFTER = 1000

@@ -18,7 +18,7 @@ from full_host import PLANNED, config_of, train, trainer_of, watch  # noqa: E402
 
 from edge_se_sampler.nerfstudio.planned import WATCH_FILE  # noqa: E402
 from edge_se_sampler.nerfstudio.scoring import HOPELESS_AFTER, squared_errors  # noqa: E402
-from edge_se_sampler.schedule import WINDOW_STEPS  # noqa: E402
+from edge_se_sampler.sampling.schedule import WINDOW_STEPS  # noqa: E402
 
 
 def auto(name: str, scene: Path, runs: Path, **changes: Any) -> Any:

@@ -17,9 +17,9 @@ pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio
 
 from full_host import config_of, trainer_of  # noqa: E402
 
-from edge_se_sampler.edges import WHITE  # noqa: E402
 from edge_se_sampler.errors import InputError  # noqa: E402
 from edge_se_sampler.nerfstudio import scoring  # noqa: E402
+from edge_se_sampler.sampling.edges import WHITE  # noqa: E402
 
 METHODS = ["se-nerf", "edge-se-nerfacto"]
 

@@ -37,18 +37,18 @@ from nerfstudio.data.pixel_samplers import (  # noqa: E402
 )
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation  # noqa: E402
 
-from edge_se_sampler import sampling_settings  # noqa: E402
 from edge_se_sampler.data.blender import Views, read_blender  # noqa: E402
 from edge_se_sampler.data.config import VanillaDataManagerConfig  # noqa: E402
 from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig  # noqa: E402
 from edge_se_sampler.engine.pipeline import Pipeline  # noqa: E402
-from edge_se_sampler.engine.plan import planned  # noqa: E402
+from edge_se_sampler.engine.resolve import planned  # noqa: E402
 from edge_se_sampler.engine.run_folder import RunFolder  # noqa: E402
 from edge_se_sampler.engine.trainer import Trainer  # noqa: E402
 from edge_se_sampler.errors import InputError  # noqa: E402
 from edge_se_sampler.methods import STRATEGIES  # noqa: E402
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig  # noqa: E402
-from edge_se_sampler.pixel_sampler import ImportantPixels  # noqa: E402
+from edge_se_sampler.sampling import settings as settings_module  # noqa: E402
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels  # noqa: E402
 
 NUMBERS = (40, 7, 23)
 """Absolute image numbers, neither in order nor from 0."""
@@ -144,7 +144,7 @@ def test_the_host_is_nerfstudio_itself_and_not_our_own_protocol() -> None:
 def test_the_same_pixels_are_drawn_as_on_our_own_base(kind: str, strategy: str, images_per_step: Any) -> None:
     batch = BATCHES[kind]()
     settings = STRATEGY_SETTINGS[strategy] | {"images_per_step": images_per_step}
-    ours = bound(sampling_settings.EdgeSEPixelSamplerConfig(**settings))
+    ours = bound(settings_module.EdgeSEPixelSamplerConfig(**settings))
     theirs = of_host(strategy, images_per_step=images_per_step)
     assert type(ours).__mro__[1] is type(theirs).__mro__[1] is ImportantPixels
     assert not isinstance(ours, PixelSampler)
@@ -403,7 +403,7 @@ def test_their_sampler_keeps_to_the_masks_of_our_data_manager() -> None:
 def test_training_is_the_same_with_our_sampler_on_either_base(scene: Path) -> None:
     """Bound, told the step and asked for errors by the same data manager: both phases, to the last bit."""
     views = read_blender(scene, "train")
-    ours = trainer_with(sampling_settings.EdgeSEPixelSamplerConfig(early_fraction=0.2, images_per_step="all"), views)
+    ours = trainer_with(settings_module.EdgeSEPixelSamplerConfig(early_fraction=0.2, images_per_step="all"), views)
     theirs = trainer_with(EdgeSEPixelSamplerConfig(early_fraction=0.2), views)
     assert isinstance(theirs.pipeline.datamanager.train_pixel_sampler, PixelSampler)
     strategies = []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from edge_se_sampler.bench.chart.external import ProgramName
+from edge_se_sampler.bench.baselines.results import ProgramName
 from edge_se_sampler.errors import InputError, check_known
 
 
@@ -42,13 +42,13 @@ class BenchChart:
     def run(self) -> None:
         from concurrent.futures import ThreadPoolExecutor
 
-        from edge_se_sampler.bench.chart.external import read_external
+        from edge_se_sampler.bench.baselines.results import read_external
         from edge_se_sampler.bench.chart.outputs import write_outputs
         from edge_se_sampler.bench.chart.train import Scale, run_cell
-        from edge_se_sampler.bench.chart.variant import VARIANTS, cells
-        from edge_se_sampler.bench.experiment import alone, begun, default_workers, missing, run_cells
+        from edge_se_sampler.bench.chart.variants import VARIANTS, cells
+        from edge_se_sampler.bench.runner import alone, begun, default_workers, missing, run_cells
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.show import require_pyplot
+        from edge_se_sampler.engine.show import require_pyplot
 
         check_known("variants", self.variants, VARIANTS)
         _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)
@@ -105,7 +105,7 @@ class BenchBeside:
     """Of a training, as bench chart has it; one training at a time."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.chart.beside import run_beside
+        from edge_se_sampler.bench.baselines.run import run_beside
         from edge_se_sampler.bench.chart.train import Scale
         from edge_se_sampler.engine.files import make_room
 
@@ -143,8 +143,8 @@ class BenchStep:
     """Steps of each that count."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.chart.step import bench_step
-        from edge_se_sampler.bench.scoring import scene_in
+        from edge_se_sampler.bench.baselines.step import bench_step
+        from edge_se_sampler.bench.micro.scoring import scene_in
         from edge_se_sampler.engine.files import make_room, write_json
 
         if self.rounds < 1:
@@ -169,7 +169,7 @@ def _pixels(data: Path | None, scenes: tuple[str, ...]) -> int:
     """Longer side of the scenes' images."""
     from edge_se_sampler.bench.chart.train import Scale
     from edge_se_sampler.data.blender import read_blender
-    from edge_se_sampler.data.made.catalogue import ANALOG_OF
+    from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
 
     if data is None:
         check_known("scenes", scenes, ANALOG_OF)
@@ -183,6 +183,6 @@ def _pixels(data: Path | None, scenes: tuple[str, ...]) -> int:
 
 def _folder(data: Path | None, workplace: Path, scene: str) -> Path:
     """A scene's, made if there are no --data."""
-    from edge_se_sampler.bench.scoring import scene_in
+    from edge_se_sampler.bench.micro.scoring import scene_in
 
     return scene_in(workplace, scene) if data is None else data / scene

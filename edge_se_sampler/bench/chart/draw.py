@@ -19,8 +19,8 @@ from edge_se_sampler.bench.chart.summary import (
     scenes_of,
 )
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
-from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
-from edge_se_sampler.show import require_pyplot
+from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS, Group
+from edge_se_sampler.engine.show import require_pyplot
 
 MIB = 2**20
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.chart.summary import RECOMMENDED, rows_of, rows_of_others
-from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS
+from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS
 from edge_se_sampler.bench.page import figure, grid, page
 
 TITLE = "NeRF on a plain CPU: speed against accuracy"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.bench.chart.train import LOOKS
-from edge_se_sampler.bench.chart.variant import GROUPS, VARIANTS, Group
+from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS, Group
 
 Run = dict[str, Any]
 RECOMMENDED = "lean"

@@ -18,14 +18,14 @@ from typing import Any
 
 import torch
 
-from edge_se_sampler.bench.chart.variant import Cell, config_of
+from edge_se_sampler.bench.chart.variants import Cell, config_of
 from edge_se_sampler.bench.machine import resident_memory
-from edge_se_sampler.bench.outcome import judged
+from edge_se_sampler.bench.outcomes import judged
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, evaluate, psnr, render_rays, shade_behind, target_image
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.nerf.ray_model import RayModel
+from edge_se_sampler.models.ray_model import RayModel
 
 LOOKS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)
 """Seconds of training after which the test views are looked at."""

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.paper.cell import LATE_SE, RANDOMS_TIME, TABLES, Cell, Preset, config_of, iterations_of
-from edge_se_sampler.cameras import RayBundle
+from edge_se_sampler.bench.paper.trials import LATE_SE, RANDOMS_TIME, TABLES, Cell, Preset, config_of, iterations_of
+from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.trainer import choose_device
-from edge_se_sampler.nerf.config import resolved
+from edge_se_sampler.models.config import resolved
 
 
 def plan_of(cells: list[Cell], done: int, preset: Preset, workers: int) -> str:

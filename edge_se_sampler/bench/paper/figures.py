@@ -14,13 +14,13 @@ import cv2
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.bench.paper.cell import PAPERS, TABLES, Cell
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
-from edge_se_sampler.bench.paper.verdict import LABEL, failed
+from edge_se_sampler.bench.paper.trials import PAPERS, TABLES, Cell
+from edge_se_sampler.bench.paper.verdicts import LABEL, failed
 from edge_se_sampler.data.blender import Views, read_blender
-from edge_se_sampler.edges import edge_strength, unit_float
 from edge_se_sampler.engine.evaluation import edge_band
-from edge_se_sampler.show import require_pyplot, save_figure
+from edge_se_sampler.engine.show import require_pyplot, save_figure
+from edge_se_sampler.sampling.edges import edge_strength, unit_float
 
 COLORS = {"vanilla-nerf": "#1f77b4", "precrop-nerf": "#ff7f0e", "edge-nerf": "#2ca02c"}
 """The paper's."""

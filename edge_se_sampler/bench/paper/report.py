@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.page import figure, grid, page
-from edge_se_sampler.bench.paper.cell import TABLES
 from edge_se_sampler.bench.paper.published import LABELS, STRATEGIES
 from edge_se_sampler.bench.paper.tables import LEGEND, VERDICT_LEGEND, Entry, Rows, interval, rows_of
-from edge_se_sampler.bench.paper.verdict import failed
+from edge_se_sampler.bench.paper.trials import TABLES
+from edge_se_sampler.bench.paper.verdicts import failed
 
 CAPTIONS = {
     "sheet": "The first held-out view of every scene as every strategy rendered it, first seed; red: failed.",

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.paper.cell import TABLES, Cell, Placement, Preset
 from edge_se_sampler.bench.paper.published import SCENES
+from edge_se_sampler.bench.paper.trials import TABLES, Cell, Placement, Preset
 from edge_se_sampler.data.blender import has_split
-from edge_se_sampler.data.made.catalogue import ANALOG_OF
-from edge_se_sampler.data.made.folder import make_scenes
 from edge_se_sampler.data.offcenter import offcenter
+from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 

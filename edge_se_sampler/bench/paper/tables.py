@@ -6,9 +6,9 @@ import statistics
 from dataclasses import dataclass
 from typing import Any
 
-from edge_se_sampler.bench.paper.cell import PAPERS, TABLES
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES, published
-from edge_se_sampler.bench.paper.verdict import failed
+from edge_se_sampler.bench.paper.trials import PAPERS, TABLES
+from edge_se_sampler.bench.paper.verdicts import failed
 
 LEGEND = (
     "Test PSNR in dB: mean over the seeds that all strategies have ± deviation; ✗ failures of runs (no better than the "

@@ -17,22 +17,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.bench.outcome import outcome
-from edge_se_sampler.bench.stability.point import STRATEGIES, Cell, Point, points
-from edge_se_sampler.bench.stability.scene import COLORS, behind, views
+from edge_se_sampler.bench.outcomes import outcome
+from edge_se_sampler.bench.stability.scenes import COLORS, behind, views
+from edge_se_sampler.bench.stability.settings import STRATEGIES, Cell, Point, points
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render_rays
 from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
-from edge_se_sampler.engine.plan import planned
-from edge_se_sampler.engine.revival import dead_networks
+from edge_se_sampler.engine.reinitialization import dead_networks
+from edge_se_sampler.engine.resolve import planned
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import keep_freed_memory
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.nerf.config import NeRFModelConfig
-from edge_se_sampler.nerf.model import NeRFModel
-from edge_se_sampler.nerf.ray_model import target_colors
+from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.nerf import NeRFModel
+from edge_se_sampler.models.ray_model import target_colors
 
 Ending = Literal["learnt", "slow", "dead at the start", "killed by the data", "opaque background"]
 LEARNING_RATE = 3e-3

@@ -1,0 +1,47 @@
+"""The seven made scenes, one file each, and the scene of NeRF's Blender set that each stands in for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from functools import cache
+
+from edge_se_sampler.data.synthetic.catalogue.bricks import bricks
+from edge_se_sampler.data.synthetic.catalogue.chair import chair
+from edge_se_sampler.data.synthetic.catalogue.drums import drums
+from edge_se_sampler.data.synthetic.catalogue.ficus import ficus
+from edge_se_sampler.data.synthetic.catalogue.hotdog import hotdog
+from edge_se_sampler.data.synthetic.catalogue.materials import materials
+from edge_se_sampler.data.synthetic.catalogue.mic import mic
+from edge_se_sampler.data.synthetic.scene import Scene, SceneBuilder
+from edge_se_sampler.errors import InputError
+
+_BUILDERS: dict[str, Callable[[SceneBuilder], None]] = {
+    "chair": chair,
+    "drums": drums,
+    "ficus": ficus,
+    "hotdog": hotdog,
+    "bricks": bricks,
+    "materials": materials,
+    "mic": mic,
+}
+SCENE_NAMES = tuple(_BUILDERS)
+ANALOG_OF = {name: "lego" if name == "bricks" else name for name in SCENE_NAMES}
+
+
+@cache
+def made_scene(name: str) -> Scene:
+    """The scene called `name`, built once. Raises InputError if there is none; the message names the nearest."""
+    check_name(name)
+    builder = SceneBuilder()
+    _BUILDERS[name](builder)
+    return builder.build()
+
+
+def check_name(name: str) -> None:
+    """Raises InputError if no made scene is called `name`."""
+    if name in _BUILDERS:
+        return
+    known = {ANALOG_OF[made]: made for made in SCENE_NAMES} | {made: made for made in SCENE_NAMES}
+    nearest = known[get_close_matches(name, known, n=1, cutoff=0)[0]]
+    raise InputError(f"no made scene is called {name!r}: did you mean {nearest!r}? There are {', '.join(SCENE_NAMES)}")

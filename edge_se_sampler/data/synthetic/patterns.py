@@ -1,0 +1,67 @@
+"""Surface patterns: how much of a material's second colour shows at a point, 0 to 1.
+
+q  point times the pattern's frequency, so that a period is 1; in the world for most patterns, in the solid's own
+   frame for rings
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_se_sampler.data.synthetic.linear import Array, Index
+from edge_se_sampler.data.synthetic.scene import Pattern
+
+_LATTICE_PRIMES = (374761393, 668265263, 2147483647)
+
+
+def second_share(pattern: int, world: Array, local: Array, frequency: Array) -> Array:
+    """Share (n,) of the second colour at points (3, n), given in the world and in their solids' frames."""
+    q = world * frequency
+    if pattern == Pattern.CHECKER:
+        i, j, k = np.floor(q + 1e-4)  # 1e-4: a face that lies in a lattice plane does not flicker
+        return np.mod(i + j + k, 2)
+    if pattern == Pattern.STRIPES:
+        return (_fraction(q[0] + q[1]) < 0.35).astype(np.float64)
+    if pattern == Pattern.BLOTCHES:
+        return np.clip(1.6 * (0.65 * value_noise(q) + 0.35 * value_noise(2.03 * q)) - 0.3, 0, 1)
+    if pattern == Pattern.RINGS:
+        x, y = local[:2] * frequency
+        return (_fraction(np.sqrt(x * x + y * y)) < 0.3).astype(np.float64)
+    if pattern == Pattern.WOOD:
+        years = np.sqrt(q[0] * q[0] + q[1] * q[1])
+        waver = value_noise(np.stack([q[0], q[1], 0.3 * q[2]]))
+        return smooth_step(np.abs(2 * _fraction(1.43 * years + 0.8 * waver - 0.25) - 1))
+    return np.zeros(world.shape[1])
+
+
+def smooth_step(x: Array) -> Array:
+    """A smooth rise from 0 to 1 over 0 <= x <= 1."""
+    return x * x * (3 - 2 * x)
+
+
+def value_noise(q: Array) -> Array:
+    """Smooth noise (n,) in 0..1 at points (3, n): fixed random values on whole numbers, blended between them."""
+    base = np.floor(q)
+    weight_one = smooth_step(q - base)
+    base = base.astype(np.int64)
+    total = np.zeros(q.shape[1])
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                weight = np.ones(q.shape[1])
+                for axis, step in enumerate((i, j, k)):
+                    weight = weight * (weight_one[axis] if step else 1 - weight_one[axis])
+                total = total + weight * _lattice_value(base[0] + i, base[1] + j, base[2] + k)
+    return total
+
+
+def _lattice_value(i: Index, j: Index, k: Index) -> Array:
+    """A fixed random number in 0..1 for each triple of whole numbers (an integer hash)."""
+    a, b, c = _LATTICE_PRIMES
+    h = (i * a + j * b + k * c) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    return ((h ^ (h >> 16)) & 0xFFFF) / 65535
+
+
+def _fraction(x: Array) -> Array:
+    return x - np.floor(x)

@@ -1,0 +1,71 @@
+"""From a scene and a camera to a picture: sampling, averaging, tone.
+
+A pixel averages SAMPLES_PER_AXIS^2 rays on a regular grid. Alpha is the share of them that meets the scene; colour
+is the mean radiance of those alone (straight alpha), clipped, sRGB-encoded. Float64 throughout, then 8 bits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edge_se_sampler.data.synthetic.cameras import Camera
+from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.linear import Array, apply, unit, vector
+from edge_se_sampler.data.synthetic.scene import Scene
+from edge_se_sampler.data.synthetic.shading import radiance
+from edge_se_sampler.data.synthetic.visibility import NOTHING, first_hits
+
+SAMPLES_PER_AXIS = 4
+_BATCH = 1 << 16  # points shaded together: bounds the memory
+_BRIGHTEST = 4.0  # radiance of one sample is clipped here, so that a glint does not bleach its whole pixel
+
+
+def _srgb_steps() -> Array:
+    """Linear values (255,) at which the 8-bit sRGB code rises by one."""
+    encoded = [(code - 0.5) / 255 for code in range(1, 256)]
+    linear = [e / 12.92 if e <= 0.04045 else ((e + 0.055) / 1.055) ** 2.4 for e in encoded]
+    return np.round(linear, 14)  # the same on every platform's pow
+
+
+_SRGB_STEPS = _srgb_steps()
+
+
+def render_view(
+    name: str, camera_to_world: ArrayLike, focal: float, principal: tuple[float, float], width: int, height: int
+) -> NDArray[np.uint8]:
+    """One view of a made scene.
+
+    `camera_to_world` is (4, 4) or (3, 4) in NeRF's convention (x right, y up, looking along -z; a rotation and an eye
+    in world units), `focal` and `principal` (x, y) are in pixels, pixel (0, 0) having its centre at (0.5, 0.5).
+    Returns (height, width, 4) RGBA, 8 bits, straight alpha, sRGB-encoded; the same bytes on every machine.
+
+    Raises InputError for a name that is not in SCENE_NAMES.
+    """
+    return render(made_scene(name), Camera(vector(camera_to_world), focal, principal, width, height))
+
+
+def render(scene: Scene, camera: Camera) -> NDArray[np.uint8]:
+    """The camera's picture (height, width, 4) of the scene: RGBA, 8 bits, straight alpha."""
+    depth, seen = first_hits(scene, camera, SAMPLES_PER_AXIS)
+    rows, columns = np.nonzero(seen != NOTHING)
+    pixels = rows // SAMPLES_PER_AXIS * camera.width + columns // SAMPLES_PER_AXIS
+    count = camera.width * camera.height
+    total = np.zeros((3, count))
+    x_slopes, y_slopes = camera.sample_slopes(SAMPLES_PER_AXIS)
+    for start in range(0, len(rows), _BATCH):
+        batch = np.s_[start : start + _BATCH]
+        row, column = rows[batch], columns[batch]
+        slopes = np.stack([x_slopes[column], y_slopes[row], np.full(len(row), -1.0)])
+        rays = apply(camera.to_world[:3, :3], slopes)
+        points = camera.to_world[:3, 3:4] + depth[row, column] * rays
+        light = np.minimum(radiance(scene, seen[row, column], points, unit(rays)), _BRIGHTEST)
+        for channel in range(3):
+            total[channel] += np.bincount(pixels[batch], weights=light[channel], minlength=count)
+
+    hits = np.bincount(pixels, minlength=count)
+    picture = np.zeros((count, 4), dtype=np.uint8)
+    picture[:, :3] = np.searchsorted(_SRGB_STEPS, (total / np.maximum(hits, 1)).T, side="right")
+    samples = SAMPLES_PER_AXIS * SAMPLES_PER_AXIS
+    picture[:, 3] = (2 * 255 * hits + samples) // (2 * samples)  # rounds to nearest
+    return picture.reshape(camera.height, camera.width, 4)

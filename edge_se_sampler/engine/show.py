@@ -1,0 +1,112 @@
+"""A picture of what a sampler does to one's own images: view, probability, and where a batch really fell."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.datamanager import image_batch
+from edge_se_sampler.engine.files import write_atomically
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling.distribution import PixelTable
+from edge_se_sampler.sampling.edges import luma, unit_float
+from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+
+
+def probability_map(sampler: EdgeSEPixelSampler, batch: ImageBatch, strategy: str, k: int) -> np.ndarray:
+    """p of every pixel of the view at position k, (H, W); sums to 1 (or is 0 where all is masked)."""
+    table = PixelTable()
+    strength = torch.from_numpy(sampler.strength(strategy, batch.image(k)))
+    table.add([strength if batch.mask is None else strength * batch.valid(k)])
+    return table.probability(0).numpy()
+
+
+def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Path, num_views: int, seed: int) -> None:
+    """Draw the figure.
+
+    Args:
+        views: training views.
+        config: of the sampler; num_rays_per_batch pixels are drawn from each view.
+        strategy: "uniform", "precrop" or "edge".
+        num_views: how many views, evenly spread.
+
+    Raises:
+        InputError: matplotlib is missing, or the settings do not fit the images.
+    """
+    pyplot = require_pyplot()
+    sampler = EdgeSEPixelSampler(config)
+    batch = ImageBatch.of(image_batch(views), use_mask=not config.ignore_mask)
+    chosen = np.unique(np.linspace(0, len(views.images) - 1, num_views).round().astype(int)).tolist()
+    figure, axes = pyplot.subplots(len(chosen), 3, figsize=(9.6, 3.35 * len(chosen)), squeeze=False)
+    for row, k in zip(axes, chosen, strict=True):
+        try:
+            p = probability_map(sampler, batch, strategy, k)
+        except ValueError as problem:
+            raise InputError(f"{views.names[k]}: {problem}") from problem
+        _show_view(row, views, k, p, strategy, config.num_rays_per_batch, stream(seed, k, Stream.PIXELS))
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def _show_view(axes, views: Views, k: int, p: np.ndarray, strategy: str, count: int, rng: np.random.Generator) -> None:
+    image = unit_float(views.images[k])
+    height, width = p.shape
+    color = image[..., :3]
+    if image.shape[2] == 4:
+        color = color * image[..., 3:] + 1 - image[..., 3:]
+    axes[0].imshow(color, interpolation="nearest")
+    axes[0].set_title(f"view {k}: {views.names[k]}", fontsize=9)
+    relative = p * max(np.count_nonzero(p), 1)
+    shown = axes[1].imshow(relative, cmap="magma", interpolation="nearest", vmin=0)
+    axes[1].set_title(f"{strategy}: probability, 1 = uniform", fontsize=9)
+    axes[1].figure.colorbar(shown, ax=axes[1], fraction=0.046, pad=0.03).ax.tick_params(labelsize=7)
+    axes[2].imshow(0.75 + 0.25 * luma(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    caption = "all masked: never drawn"
+    if p.any():
+        table = PixelTable()
+        table.add([torch.from_numpy(p)])
+        drawn = table.draw(torch.tensor([0]), count, rng).numpy()
+        axes[2].scatter(drawn[:, 2], drawn[:, 1], s=max(2e4 / (height * width), 0.6) ** 0.5 * 2, c="#d62728", lw=0)
+        caption = f"{count} drawn pixels"
+        if image.shape[2] == 4:
+            inside = (image[drawn[:, 1], drawn[:, 2], 3] > 0).mean()
+            covered = (image[..., 3] > 0).mean()
+            caption = f"{count} drawn: {inside:.0%} on the object,\nwhich covers {covered:.0%} of the image"
+    axes[2].set_title(caption, fontsize=9)
+    for axis in axes:
+        axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+
+
+def require_pyplot():
+    """matplotlib's pyplot, drawing to files.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        raise InputError("pictures need the [plots] extra: pip install 'edge-se-sampler[plots]'") from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def save_figure(figure, path: Path) -> None:
+    """Write a figure as PNG and close it.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    require_pyplot().close(figure)
+    write_atomically(path, buffer.getvalue())

@@ -1,1 +1,0 @@
-"""The vanilla NeRF (Mildenhall et al. 2020)."""

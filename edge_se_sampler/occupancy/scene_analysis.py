@@ -1,0 +1,162 @@
+"""What a scene needs, derived from its cameras and its alpha: where to look, and how closely."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import RayGenerator
+from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.config import LeanModelConfig, ModelConfig
+from edge_se_sampler.occupancy.grid import MOST_CELLS, OccupancyGrid
+from edge_se_sampler.occupancy.hull import (
+    AHEAD,
+    AROUND,
+    Box,
+    Hull,
+    Silhouette,
+    box_of,
+    carve,
+    footprint,
+    projected,
+    silhouettes,
+)
+
+MOST_PLACES = 2**24
+"""Cells of the box around them, which grids have a number for, occupied or not."""
+TOLERATED = 0.01
+"""Share of the foreground's pixels that may meet no cell, by stray ones."""
+COARSER = 1
+"""How often a hull's cells are doubled where training is to split them."""
+LOOKED_AT = 4096
+ROUGH = 64
+"""Cells along the box of a first hull, which tells how many finer ones there will be."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Of a scene."""
+
+    box: Box
+    footprint: float
+    """Of a pixel at the box's middle, world units."""
+    silhouettes: int
+    """Views whose alpha tells the object from the background."""
+    hull: Hull
+    """The cells that may hold something."""
+    coarser: int
+    """How often their sides are doubled for training to begin with."""
+    splits: int
+    """How often training may halve them, where it finds something."""
+
+    def grid(self) -> OccupancyGrid:
+        """The cells, as training begins with them."""
+        return OccupancyGrid.of(self.hull, self.splits, self.coarser)
+
+
+def needs(views: Views, config: ModelConfig) -> Needs:
+    """Derive what training views need under a resolved config.
+
+    Where training is to tell which cells are empty, it begins with large ones: of the hull, twice as large; where
+    nothing is carved away, few enough for each to be split.
+
+    Raises:
+        InputError: the cameras see nothing of what they look at.
+    """
+    lean = config if isinstance(config, LeanModelConfig) else None
+    by_alpha = config.economy == "auto" and (lean is None or lean.cull_by_alpha)
+    learns = lean is not None and lean.learns_cells
+    at_first = MOST_CELLS // 8 if learns else MOST_CELLS
+    box = box_of(views, config.near, config.far)
+    pixel = footprint(views, box)
+    side = config.cell_pixels * pixel
+    shown = silhouettes(views) if by_alpha else {}
+    hull = _hull(views, shown, box, side, MOST_CELLS if shown else at_first)
+    if shown and (hull is None or _missed(views, shown, hull) > TOLERATED):
+        print(
+            "the views' alpha masks do not agree on where the object is, or show too little of it: they carve nothing "
+            "away",
+            file=sys.stderr,
+        )
+        shown, hull = {}, _hull(views, {}, box, side, at_first)
+    if hull is None:
+        raise InputError(
+            "no training view sees anything of what lies between --pipeline.model.near and far around "
+            f"({', '.join(f'{x:.2f}' for x in box.middle)}): check the cameras' poses and principal points"
+        )
+    coarser = COARSER if learns and shown else 0
+    return Needs(box, pixel, len(shown), hull, coarser, coarser or (_splits(hull, side) if learns else 0))
+
+
+def _splits(hull: Hull, side: float) -> int:
+    """How often cells are to be halved to come to a side; no more often than there are numbers for them."""
+    wanted, possible = np.log2(hull.side / side), np.log2(MOST_PLACES / hull.cells.size) / 3
+    return max(0, int(min(np.round(wanted), np.floor(possible))))
+
+
+def _hull(views: Views, shown: dict[int, Silhouette], box: Box, side: float, most: int) -> Hull | None:
+    """Of cells of that side, or larger ones where there would be more than `most`; None if nothing is left."""
+    rough = carve(views, shown, box, 2 * box.half / ROUGH)
+    if rough is None:
+        return None
+    volume = max(rough.cells.sum() / most, rough.cells.size / MOST_PLACES) * rough.side**3
+    return carve(views, shown, box, max(side, float(np.cbrt(volume))))
+
+
+def _missed(views: Views, shown: dict[int, Silhouette], hull: Hull) -> float:
+    """Share of the foreground's pixels, or of some of them, whose ray meets no cell."""
+    some = spread_pixels({i: views.images[i][..., 3] > 0 for i in shown}, LOOKED_AT)
+    rays = RayGenerator(cameras_of(views))(some)
+    met = OccupancyGrid.of(hull).march(rays, hull.side / 4, None).ray
+    return 1 - len(met.unique()) / len(some)
+
+
+def spread_pixels(masks: Mapping[int, np.ndarray], most: int) -> torch.Tensor:
+    """At most so many of the pixels in masks (H, W) of images by number, evenly spread: (n, 3) image, row, column."""
+    counts = [np.count_nonzero(mask) for mask in masks.values()]
+    ends = np.cumsum(counts)
+    chosen = np.linspace(0, ends[-1] - 1, min(most, ends[-1])).astype(int)
+    found = []
+    for (number, mask), count, end in zip(masks.items(), counts, ends, strict=True):
+        mine = chosen[(chosen >= end - count) & (chosen < end)] - (end - count)
+        row, column = np.divmod(np.flatnonzero(mask)[mine], mask.shape[1])
+        found.append(np.stack((np.full(len(mine), number), row, column), axis=1))
+    return torch.from_numpy(np.concatenate(found))
+
+
+def live_pixels(views: Views, hull: Hull) -> list[np.ndarray]:
+    """(H, W) bool of each view: all pixels whose ray meets a cell of the hull, and few others."""
+    centers = hull.corner + (np.argwhere(_outermost(hull.cells)) + 0.5) * hull.side
+    return [_covered(views, number, centers, hull.side) for number in range(len(views.images))]
+
+
+def _outermost(cells: np.ndarray) -> np.ndarray:
+    """(X, Y, Z) bool: cells with one of the 26 around them empty; a ray from outside meets one of these first."""
+    inner = np.pad(cells, 1)
+    for axis in range(3):
+        inner = inner & np.roll(inner, 1, axis) & np.roll(inner, -1, axis)
+    return cells & ~inner[1:-1, 1:-1, 1:-1]
+
+
+def _covered(views: Views, number: int, centers: np.ndarray, side: float) -> np.ndarray:
+    """Pixels covered by cells: their middles, made as large as the largest of their rectangles; all of them, if a cell
+    is around the camera or as large as the image."""
+    height, width = views.images[number].shape[:2]
+    low, high, where = projected(views, number, centers, side)
+    shown = (where == AHEAD) & (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
+    low, high = low[:, shown], high[:, shown]
+    reach = int(np.ceil((high - low).max(initial=0) / 2)) + 1
+    if (where == AROUND).any() or reach > max(height, width):
+        return np.ones((height, width), dtype=bool)
+    column, row = np.floor((low + high) / 2).astype(np.int64) + reach
+    wide = np.zeros((height + 2 * reach, width + 2 * reach), dtype=np.uint8)
+    wide[row, column] = 1
+    count, size = cv2.integral(wide), 2 * reach + 1
+    return count[size:, size:] - count[:-size, size:] - count[size:, :-size] + count[:-size, :-size] > 0

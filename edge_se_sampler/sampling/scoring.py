@@ -1,0 +1,39 @@
+"""What squared-error sampling needs of a data manager, of any host: the model's errors on candidate pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels, SquaredError
+
+RayErrors = Callable[[Any, Any, dict[str, Tensor]], Tensor]
+"""Model, ray bundle (n rays), batch -> (n,) squared errors of the model's fine colours on the batch's pixels."""
+
+
+def scoring(
+    sampler: ImportantPixels, pipeline: Any, ray_generator: Callable[[Tensor], Any], ray_errors: RayErrors
+) -> SquaredError:
+    """How a sampler's candidates are scored: a training batch at a time, so that it takes no more memory than training.
+
+    Args:
+        sampler: its number of rays, which hosts may change at any time, is the size of a batch.
+        pipeline: whose `model` is asked. It must not be kept on a data manager: nerfstudio's is a module, and would
+            count the model's weights as its own.
+        ray_generator: (n, 3) indices -> ray bundle.
+        ray_errors: how this host compares a rendered ray.
+    """
+
+    @torch.no_grad()
+    def squared_error(candidates: dict[str, Tensor]) -> Tensor:
+        errors = []
+        for start in range(0, len(candidates["indices"]), sampler.num_rays_per_batch):
+            rows = slice(start, start + sampler.num_rays_per_batch)
+            batch = {key: candidates[key][rows] for key in ("indices", "image")}
+            errors.append(ray_errors(pipeline.model, ray_generator(batch["indices"]), batch))
+        return torch.cat(errors)
+
+    return squared_error
