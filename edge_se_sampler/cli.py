@@ -226,9 +226,9 @@ class Inspect:
     """Depth along the optical axis at which samples begin, world units."""
     far: float = LeanModelConfig.far
     """Depth at which samples end."""
-    cell_pixels: float = LeanModelConfig.cell_pixels
+    voxel_size_px: float = LeanModelConfig.voxel_size_px
     """Side of a cell, in pixels' footprints."""
-    step_cells: float = LeanModelConfig.step_cells
+    step_size_voxels: float = LeanModelConfig.step_size_voxels
     """Distance between samples, in sides of a cell."""
 
     def run(self) -> None:
@@ -237,7 +237,9 @@ class Inspect:
         from edge_se_sampler.engine.inspection import inspect
 
         check_output(self.output_path)
-        asked = LeanModelConfig(near=self.near, far=self.far, cell_pixels=self.cell_pixels, step_cells=self.step_cells)
+        asked = LeanModelConfig(
+            near=self.near, far=self.far, voxel_size_px=self.voxel_size_px, step_size_voxels=self.step_size_voxels
+        )
         check_fineness(asked)
         print(inspect(read_blender(self.data, "train"), asked, self.output_path))
         print(self.output_path)

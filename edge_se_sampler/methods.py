@@ -52,7 +52,7 @@ def _specification(name: str) -> MethodSpecification:
 def _lean() -> MethodSpecification:
     """What we recommend."""
     sampler = EdgeSEPixelSamplerConfig(early="auto", late="uniform", images_per_step="all")
-    manager = VanillaDataManagerConfig(live_pixels_only=True, pixel_sampler=sampler)
+    manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
     pipeline, adam = PipelineConfig(manager, LeanModelConfig()), OptimizerConfig(eps=1e-15, fused=True)
     config = TrainerConfig(method_name=LEAN, pipeline=pipeline, optimizer=adam)
     return MethodSpecification(config, "One small network, asked only where the scene is: what we recommend")

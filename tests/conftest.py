@@ -1,4 +1,4 @@
-"""What several tests share: a tiny made scene and the command line, called in this process."""
+"""What several tests share: a tiny synthetic scene and the command line, called in this process."""
 
 from __future__ import annotations
 

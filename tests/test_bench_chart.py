@@ -30,7 +30,7 @@ from edge_se_sampler.bench.chart.variants import VARIANTS, Cell, cells, changed,
 from edge_se_sampler.bench.runner import alone
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
-from edge_se_sampler.engine.resolve import planned
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 
@@ -57,7 +57,7 @@ def test_a_variant_is_a_method_with_its_changes_and_can_be_planned(name: str, ma
         assert before != value  # it changes something
     if not variant.changes:
         assert config.pipeline == plain.pipeline
-    planned(config, read_blender(made, "train"))
+    resolve_config(config, read_blender(made, "train"))
 
 
 def test_changing_a_field_leaves_the_others_and_the_original() -> None:

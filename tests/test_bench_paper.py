@@ -20,7 +20,7 @@ from edge_se_sampler.bench.outcomes import background_measures, foreground_share
 from edge_se_sampler.bench.paper import estimate
 from edge_se_sampler.bench.paper.outputs import keep_view
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES, published
-from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
+from edge_se_sampler.bench.paper.scenes import check_real, real_scenes, synthetic_scenes
 from edge_se_sampler.bench.paper.trials import PAPERS, PRESETS, TABLES, Cell, Preset, cells, config_of, run_cell
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
@@ -120,7 +120,7 @@ def experiment(tmp_path: Path) -> Callable[..., dict[str, Any]]:
     """Run cells of the small preset, in threads of this process."""
 
     def run(todo: list[Cell], train: Any = run_cell, executor: Any = lambda: ThreadPoolExecutor(1)) -> dict[str, Any]:
-        data_of, out = made_scenes(SMALL, todo, tmp_path / "w"), tmp_path / "out"
+        data_of, out = synthetic_scenes(SMALL, todo, tmp_path / "w"), tmp_path / "out"
         (out / "views").mkdir(parents=True, exist_ok=True)
         result = running.begun(out / "result.json", SMALL)
         running.run_cells(
@@ -162,7 +162,7 @@ def test_cells_are_trained_measured_and_kept(experiment: Any, tmp_path: Path) ->
 
 
 def test_a_cell_gives_the_same_result_alone_and_in_another_process(tmp_path: Path) -> None:
-    data_of = made_scenes(SMALL, TWO_CELLS[:1], tmp_path)
+    data_of = synthetic_scenes(SMALL, TWO_CELLS[:1], tmp_path)
     own = run_cell(TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "a")
     with running.executor_of(1, None)() as executor:
         other = executor.submit(run_cell, TWO_CELLS[0], SMALL, data_of(TWO_CELLS[0]), tmp_path / "b").result()

@@ -70,4 +70,4 @@ def test_medians_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_training_memory_is_measured_in_a_process_of_its_own() -> None:
     """What memory_ratio runs, with few rays."""
-    assert 1e6 < samplers.peak_bytes("se-nerf", 64, "small", "exact") < 4e9
+    assert 1e6 < samplers.peak_bytes("se-nerf", 64, "small", "fine") < 4e9

@@ -52,10 +52,10 @@ def test_arms_differ_in_the_schedule_alone() -> None:
         return settings_of(Cell("lengths", 2, "mic", 300, arm, 3), Path("d"), Path("o"))
 
     auto, fixed, random = config("auto"), config("0.2"), config("random")
-    assert auto.pipeline.datamanager.pixel_sampler.schedule == "auto"
+    assert auto.pipeline.datamanager.pixel_sampler.schedule == "adaptive"
     assert fixed.pipeline.datamanager.pixel_sampler.early_fraction == 0.2
     assert auto.pipeline.model == fixed.pipeline.model == random.pipeline.model
-    assert (auto.revive, fixed.revive, random.revive) == (True, True, False)
+    assert (auto.reinit_dead, fixed.reinit_dead, random.reinit_dead) == (True, True, False)
     assert (auto.max_num_iterations, auto.machine.seed) == (300, 3)
     assert random.pipeline.datamanager.pixel_sampler.early == "uniform"
 

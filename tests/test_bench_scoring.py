@@ -35,7 +35,7 @@ def test_the_command_measures_all_three(scene: Path, tmp_path: Path, edge_se: An
     )  # fmt: skip
     assert answer.code == 0, answer
     told = json.loads(out.read_text())
-    assert set(told["time_against_random"]) == set(told["memory_against_random"]) == {"exact", "coarse", "memory"}
+    assert set(told["time_against_random"]) == set(told["memory_against_random"]) == {"fine", "coarse", "cached"}
     assert all(0.2 < ratio < 10 for ratio in told["time_against_random"].values())
     assert told["rank_correlation_with_exact"]["coarse"] > 0.3
     assert len(answer.out.splitlines()) == 4

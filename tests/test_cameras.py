@@ -1,4 +1,4 @@
-"""Pixels become rays: against a pinhole camera written down a second time, and against the made scenes."""
+"""Pixels become rays: against a pinhole camera written down a second time, and against the synthetic scenes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.data.synthetic import make_scenes
-from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.visibility import NOTHING, nearest_hits
 from edge_se_sampler.models.ray_samples import stratified
 
@@ -144,7 +144,7 @@ def test_a_shifted_scene_has_the_rays_of_the_centred_one(folders: dict[str, Path
 def test_rays_meet_the_scene_where_its_pictures_show_it(folders: dict[str, Path], placement: str) -> None:
     """A pixel's alpha is the share of 16 rays that hit; the ray of its centre must agree where all or none do."""
     views = read_blender(folders[placement], "train")
-    scene = made_scene("bricks")
+    scene = synthetic_scene("bricks")
     for view in range(3):
         rays = RayGenerator(cameras_of(views)).image(view)
         _, met = nearest_hits(scene, rays.origins.T.double().numpy(), rays.directions.T.double().numpy())

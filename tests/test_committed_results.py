@@ -25,7 +25,7 @@ from edge_se_sampler.bench.chart.summary import (
 from edge_se_sampler.bench.chart.train import LOOKS
 from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
-from edge_se_sampler.bench.paper.scenes import made_scenes
+from edge_se_sampler.bench.paper.scenes import synthetic_scenes
 from edge_se_sampler.bench.paper.tables import alike
 from edge_se_sampler.bench.paper.trials import PAPERS, PRESETS, Cell, run_cell
 from edge_se_sampler.bench.paper.verdicts import failed, verdicts
@@ -120,7 +120,7 @@ def test_the_readme_quotes_the_papers_tables():
         ("nothing: Xavier weights, ReLU", (1, 2)),
         ("softplus density", (14, 15)),
         ("torch's initial weights", (7, 8)),
-        ("torch's initial weights, `--revive True`", (17, 18)),
+        ("torch's initial weights, `--reinit-dead True`", (17, 18)),
     ],
 )
 def test_the_readme_quotes_what_helps_random(label: str, tables: tuple[int, int]):
@@ -352,7 +352,7 @@ def test_the_readme_quotes_the_dense_step():
 @pytest.mark.parametrize("cell", [Cell(1, "mic", "edge-nerf", 0), Cell(4, "mic", "vanilla-nerf", 0)])
 def test_a_cell_of_the_papers_tables_comes_out_again(cell: Cell, tmp_path: Path):
     """On whatever machine this is: rounding grows with the steps, so the bound is what another seed would move it."""
-    data_of = made_scenes(PRESETS["cpu"], [cell], tmp_path)
+    data_of = synthetic_scenes(PRESETS["cpu"], [cell], tmp_path)
     again = run_cell(cell, PRESETS["cpu"], data_of(cell), tmp_path / "runs")
     (told,) = [run for run in result("paper/cpu/result.json")["runs"] if asdict(cell).items() <= run.items()]
     assert (again["outcome"], again["steps"]) == (told["outcome"], told["steps"])

@@ -11,11 +11,11 @@ import torch
 from goodness import ALPHA, p_value, pixel_counts
 from torch import Tensor
 
-from edge_se_sampler.sampling.distribution import FULL, B, PixelTable
+from edge_se_sampler.sampling.distribution import CDF_SCALE, B, PixelTable
 from edge_se_sampler.sampling.edges import edge_strength
 
-QUANTUM = 2 / FULL
-"""Probabilities are exact to twice 1 / FULL: a share of the block, a share of the superblock."""
+QUANTUM = 2 / CDF_SCALE
+"""Probabilities are exact to twice 1 / CDF_SCALE: a share of the block, a share of the superblock."""
 
 
 def table_of(*strengths: np.ndarray) -> PixelTable:
@@ -337,7 +337,7 @@ def test_the_quantum_is_where_documented() -> None:
     strength[0, 2] = 2.0**-29
     p = table_of(strength).probability(0)[0].tolist()
     assert p[1] == 0
-    assert p[2] * FULL == pytest.approx(2, abs=1e-6)
+    assert p[2] * CDF_SCALE == pytest.approx(2, abs=1e-6)
 
 
 # ---- the table

@@ -7,9 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_se_sampler.sampling.distribution import FULL, PixelTable
+from edge_se_sampler.sampling.distribution import CDF_SCALE, PixelTable
 
-QUANTUM = 2 / FULL
+QUANTUM = 2 / CDF_SCALE
 
 
 @st.composite

@@ -11,14 +11,14 @@ from batches import LATE, MIXED, NUMBERS, SAME, batch_of, brightness, following,
 from torch import Tensor
 
 from edge_se_sampler.sampling import error_map
-from edge_se_sampler.sampling.error_map import FADES, ErrorMemory
-from edge_se_sampler.sampling.schedule import Watch
+from edge_se_sampler.sampling.error_map import FADES, ErrorMap
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 
 EVERY = [(number, row, column) for number, size in zip(NUMBERS, MIXED, strict=True) for row, column in np.ndindex(size)]
 
 
-def memory_of(sizes: Any = MIXED) -> ErrorMemory:
-    memory = ErrorMemory()
+def memory_of(sizes: Any = MIXED) -> ErrorMap:
+    memory = ErrorMap()
     memory.add(dict(zip(NUMBERS, sizes, strict=True)))
     return memory
 
@@ -69,7 +69,7 @@ def test_what_was_never_seen_is_taken_to_be_usual() -> None:
 
 
 def test_many_pixels_share_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(error_map, "MOST_BLOCKS", 60)
+    monkeypatch.setattr(error_map, "MAX_BLOCKS", 60)
     memory = memory_of()
     assert memory.side == 3
     assert len(memory) == 3 * 5 + 7 * 2 + 2 * 2
@@ -81,19 +81,19 @@ def test_many_pixels_share_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_images_that_come_later_do_not_disturb_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = ErrorMemory()
+    memory = ErrorMap()
     memory.add({7: (9, 14)})
     memory.note(np.array([[7, 3, 3]]), np.array([2.0]), 0)
     memory.add({3: (20, 6), 7: (9, 14)})
     assert memory.recall(np.array([[7, 3, 3]]), 0, 0) == pytest.approx(2)
-    monkeypatch.setattr(error_map, "MOST_BLOCKS", 60)
+    monkeypatch.setattr(error_map, "MAX_BLOCKS", 60)
     memory.add({11: (5, 5)})  # blocks have to grow
     assert len(memory) < 60
     assert memory.recall(np.array([[7, 3, 3]]), 0, 0) == pytest.approx(0)
 
 
 def test_a_saved_memory_goes_on_as_it_was() -> None:
-    one, other, rng = memory_of(), ErrorMemory(), np.random.default_rng(2)
+    one, other, rng = memory_of(), ErrorMap(), np.random.default_rng(2)
     pixels = all_pixels()
     for step in range(20):
         one.note(pixels[rng.integers(len(pixels), size=9)], rng.random(9), step)
@@ -123,7 +123,7 @@ def never(_: Any) -> Tensor:
 
 def test_nothing_is_rendered_and_what_was_wrong_is_trained_on() -> None:
     host = batch_of()
-    sampler = following(LATE, rays=40, se_scoring="memory", squared_error=never, images_per_step="all")
+    sampler = following(LATE, rays=40, error_source="cached", squared_error=never, images_per_step="all")
     trained(sampler, host, range(LATE, LATE + 60))
     later = torch.cat(trained(sampler, host, range(LATE + 60, LATE + 160)))
     place = {number: k for k, number in enumerate(host["image_idx"].tolist())}
@@ -136,7 +136,7 @@ def test_nothing_is_rendered_and_what_was_wrong_is_trained_on() -> None:
 
 def test_remembered_errors_rank_as_true_ones_do() -> None:
     host = batch_of()
-    sampler = following(LATE, rays=40, se_scoring="memory", squared_error=never, images_per_step="all")
+    sampler = following(LATE, rays=40, error_source="cached", squared_error=never, images_per_step="all")
     trained(sampler, host, range(LATE, LATE + 80))
     every = {"indices": torch.cat([address.reshape(-1, 3) for address in host["address"]])}
     true = brightness({"image": host["image"].reshape(-1, 3)})
@@ -147,7 +147,7 @@ def test_remembered_errors_rank_as_true_ones_do() -> None:
 
 
 def test_the_early_phase_fills_the_memory() -> None:
-    sampler = following(0, se_scoring="memory", squared_error=never)
+    sampler = following(0, error_source="cached", squared_error=never)
     trained(sampler, batch_of(), range(5))
     assert sampler.memory is not None
     assert np.count_nonzero(sampler.memory.seen) > 50
@@ -163,7 +163,7 @@ def test_others_remember_nothing(late: Any) -> None:
 
 def test_masked_pixels_are_neither_drawn_nor_remembered() -> None:
     masks = half_masks(SAME)
-    sampler = following(LATE, se_scoring="memory", squared_error=never)
+    sampler = following(LATE, error_source="cached", squared_error=never)
     for drawn in trained(sampler, batch_of(masks=masks), range(LATE, LATE + 30)):
         for number, row, column in drawn.tolist():
             assert masks[NUMBERS.index(number)][row, column]
@@ -174,9 +174,11 @@ def test_the_watch_hears_of_uniform_pixels_though_only_the_wrong_ones_are_traine
 ) -> None:
     """Weighted by how likely each was kept, what is trained on tells the mean error of all: U[e]."""
     said: list[float] = []
-    monkeypatch.setattr(Watch, "observe", lambda self, *told: said.append(told[3]))
+    monkeypatch.setattr(AdaptiveSchedule, "observe", lambda self, *told: said.append(told[3]))
     host = batch_of(channels=4)
-    sampler = following(LATE, rays=60, schedule="auto", se_scoring="memory", squared_error=never, images_per_step="all")
+    sampler = following(
+        LATE, rays=60, schedule="adaptive", error_source="cached", squared_error=never, images_per_step="all"
+    )
     assert sampler.watch is not None
     sampler.watch.phase = "late"
     trained(sampler, host, range(40))

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from edge_se_sampler.occupancy.features import FeatureGrid
-from edge_se_sampler.occupancy.grid import OccupancyGrid, halved
+from edge_se_sampler.occupancy.grid import OccupancyGrid, upsample
 from edge_se_sampler.occupancy.hull import Hull
 
 SIDE = 0.5
@@ -103,7 +103,7 @@ def split_some(shown: np.ndarray, splits: int = 1) -> tuple[FeatureGrid, torch.T
     features = random_features(cells)
     owned = cells.possible & (torch.rand(cells.possible.shape, generator=torch.Generator().manual_seed(1)) < 0.5)
     for _ in range(splits):
-        owned = halved(owned)
+        owned = upsample(owned)
         features.own(owned)
     return features, owned
 
@@ -142,7 +142,7 @@ def test_corners_of_split_cells_are_stored_once() -> None:
     (cells,) = features.grid
     assert len(features.table) == 8
     cells.splits[1] = 1
-    features.own(halved(cells.possible))
+    features.own(upsample(cells.possible))
     assert len(features.table) == 8 + 27
 
 

@@ -19,11 +19,11 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.occupancy import hull as hull_module
 from edge_se_sampler.occupancy import scene_analysis as economy
-from edge_se_sampler.occupancy.grid import MOST_CELLS, OccupancyGrid
+from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
 from edge_se_sampler.occupancy.hull import (
-    AHEAD,
-    AROUND,
     BEHIND,
+    IN_FRONT,
+    STRADDLING,
     Box,
     Hull,
     box_of,
@@ -32,7 +32,7 @@ from edge_se_sampler.occupancy.hull import (
     projected,
     silhouettes,
 )  # fmt: skip
-from edge_se_sampler.occupancy.scene_analysis import MOST_PLACES, live_pixels, needs, spread_pixels
+from edge_se_sampler.occupancy.scene_analysis import MAX_GRID_CELLS, analyze_scene, live_pixels, spread_pixels
 
 VIEWS = 12
 
@@ -77,9 +77,9 @@ def with_masks(views: Views, change: Callable[[int, np.ndarray], np.ndarray]) ->
     return replace(views, images=tuple(images))
 
 
-def hull_of(views: Views, cell_pixels: float = 1.6) -> Hull:
+def hull_of(views: Views, voxel_size_px: float = 1.6) -> Hull:
     box = box_of(views, 2, 6)
-    hull = carve(views, silhouettes(views), box, cell_pixels * footprint(views, box))
+    hull = carve(views, silhouettes(views), box, voxel_size_px * footprint(views, box))
     assert hull is not None
     return hull
 
@@ -133,7 +133,7 @@ def test_a_rectangle_holds_all_of_its_cell() -> None:
     centers, side = rng.uniform(-1.5, 1.5, (500, 3)), 0.4
     for number in range(VIEWS):
         low, high, where = projected(views, number, centers, side)
-        assert (where == AHEAD).all()
+        assert (where == IN_FRONT).all()
         pose = views.camera_to_worlds[number]
         worst = []
         for corner in np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3):
@@ -149,7 +149,7 @@ def test_a_cell_around_a_camera_is_not_judged_by_it() -> None:
     views = views_of(rods())
     pose = views.camera_to_worlds[0]
     centers = pose[:, 3] - np.array([[0.0], [1.0], [-1.0]]) * pose[:, 2]
-    assert projected(views, 0, centers, 0.5)[2].tolist() == [AROUND, AHEAD, BEHIND]
+    assert projected(views, 0, centers, 0.5)[2].tolist() == [STRADDLING, IN_FRONT, BEHIND]
 
 
 # -- nothing that is seen goes
@@ -198,7 +198,7 @@ def test_wrong_masks_carve_nothing_away(damage: Callable[[int, np.ndarray], np.n
     assert missed(views, hull_of(wrong)) == 0
 
 
-@pytest.mark.parametrize(("damage", "name", "value"), [(shifted, "MARGIN", 0), (half_in_one, "WITNESSES", 1)])
+@pytest.mark.parametrize(("damage", "name", "value"), [(shifted, "MARGIN", 0), (half_in_one, "MIN_EMPTY_VIEWS", 1)])
 def test_without_margin_or_witnesses_they_would(
     damage: Callable[[int, np.ndarray], np.ndarray], name: str, value: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,7 +232,7 @@ def test_hundreds_of_views_carve_as_a_few_do(monkeypatch: pytest.MonkeyPatch) ->
         principal=np.tile(views.principal, (64, 1)),
     )  # fmt: skip
     monkeypatch.setattr(hull_module, "FEWER", 0.0)
-    monkeypatch.setattr(hull_module, "WITNESSES", 1)
+    monkeypatch.setattr(hull_module, "MIN_EMPTY_VIEWS", 1)
     np.testing.assert_array_equal(hull_of(often).cells, hull_of(views).cells)
 
 
@@ -271,14 +271,14 @@ def test_without_a_background_all_that_views_see_is_kept(opaque: bool) -> None:
     views = views_of(rods())
     images = tuple(image[..., :3] if opaque else np.full_like(image, 255) for image in views.images)
     plain = replace(views, images=images)
-    told = needs(plain, LeanModelConfig())
+    told = analyze_scene(plain, LeanModelConfig())
     assert told.silhouettes == 0
     middle = told.hull.corner + np.array(told.hull.cells.shape) * told.hull.side / 2
     np.testing.assert_allclose(middle, 0, atol=told.hull.side)
     grid = OccupancyGrid.of(told.hull)
     rng = np.random.default_rng(0)
     assert bool(grid.contains(torch.from_numpy(rng.uniform(-1, 1, (1000, 3))).float()).all())
-    assert told.hull.cells.sum() <= 1.3 * MOST_CELLS
+    assert told.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS
 
 
 def test_a_cell_behind_a_camera_is_not_seen_by_it() -> None:
@@ -297,9 +297,9 @@ def test_a_sparse_scene_has_no_grid_without_bounds(monkeypatch: pytest.MonkeyPat
     """Two specks far apart: few cells, but a box around them that grids keep numbers for."""
     specks = rods()[-2000:] * 0.02
     views = views_of(np.concatenate((specks + 0.8, specks - 0.8)), 400)
-    free = needs(views, LeanModelConfig(cell_pixels=0.7)).hull
-    monkeypatch.setattr(economy, "MOST_PLACES", 2**18)
-    bound = needs(views, LeanModelConfig(cell_pixels=0.7)).hull
+    free = analyze_scene(views, LeanModelConfig(voxel_size_px=0.7)).hull
+    monkeypatch.setattr(economy, "MAX_GRID_CELLS", 2**18)
+    bound = analyze_scene(views, LeanModelConfig(voxel_size_px=0.7)).hull
     assert free.cells.size > 2**20
     assert bound.cells.size <= 1.2 * 2**18
     assert missed(views, bound) == 0
@@ -309,16 +309,16 @@ def test_cameras_that_see_nothing_are_refused_in_one_line() -> None:
     views = views_of(rods())
     aside = replace(views, principal=views.principal + 4000)
     with pytest.raises(InputError, match=r"no training view sees anything.*principal points"):
-        needs(aside, LeanModelConfig())
+        analyze_scene(aside, LeanModelConfig())
 
 
 def test_a_part_that_is_off_does_not_carve() -> None:
     views = views_of(rods())
-    carved, whole = (needs(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
+    carved, whole = (analyze_scene(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
     assert carved.silhouettes == VIEWS
     assert whole.silhouettes == 0
     assert carved.hull.cells.sum() * carved.hull.side**3 < 0.02 * whole.hull.cells.sum() * whole.hull.side**3
-    assert needs(views, LeanModelConfig(economy="off")).silhouettes == 0
+    assert analyze_scene(views, LeanModelConfig(empty_space_skipping=False)).silhouettes == 0
 
 
 @pytest.mark.parametrize("apart", [0, 30])
@@ -329,7 +329,7 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
     def moved(i: int, alpha: np.ndarray) -> np.ndarray:
         return np.roll(alpha, (apart * (-1) ** i, apart * (-1) ** (i // 2)), axis=(0, 1))
 
-    told = needs(with_masks(views, moved), LeanModelConfig())
+    told = analyze_scene(with_masks(views, moved), LeanModelConfig())
     assert (told.silhouettes == 0) == bool(apart)
     assert capfd.readouterr().err.count("do not agree") == bool(apart)
     assert missed(views, told.hull) == 0
@@ -337,30 +337,30 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
 
 def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:
     views = views_of(rods())
-    fine = needs(views, LeanModelConfig(cell_pixels=1.6))
+    fine = analyze_scene(views, LeanModelConfig(voxel_size_px=1.6))
     assert fine.hull.side == pytest.approx(1.6 * fine.footprint)
-    many = needs(views_of(rods(), 800, 4), LeanModelConfig(cell_pixels=0.2))
+    many = analyze_scene(views_of(rods(), 800, 4), LeanModelConfig(voxel_size_px=0.2))
     assert many.hull.side > 0.2 * many.footprint
-    assert 0.05 * MOST_CELLS < many.hull.cells.sum() < MOST_CELLS
+    assert 0.05 * MAX_OCCUPIED_CELLS < many.hull.cells.sum() < MAX_OCCUPIED_CELLS
 
 
 @pytest.mark.parametrize(("size", "splits"), [(100, 2), (800, 2), (20, 0)])
 def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int, splits: int) -> None:
     views = views_of(rods(), size, 4)
-    told = needs(views, LeanModelConfig(cull_by_alpha=False))
+    told = analyze_scene(views, LeanModelConfig(cull_by_alpha=False))
     assert told.splits == splits
-    assert told.hull.cells.sum() <= 1.3 * MOST_CELLS / 8
-    assert told.hull.cells.size * 8**told.splits < MOST_PLACES
+    assert told.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS / 8
+    assert told.hull.cells.size * 8**told.splits < MAX_GRID_CELLS
     if size == 100:  # as near as halving comes to what a pixel asks
         assert 2**-0.5 < told.hull.side / 2**splits / told.footprint < 2**0.5
     for settled in (
-        needs(views, LeanModelConfig(cull_by_density=False)),
-        needs(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
-        needs(views, LeanModelConfig(economy="off")),
-        needs(views, NeRFModelConfig(economy="auto")),
+        analyze_scene(views, LeanModelConfig(cull_by_density=False)),
+        analyze_scene(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
+        analyze_scene(views, LeanModelConfig(empty_space_skipping=False)),
+        analyze_scene(views, NeRFModelConfig(empty_space_skipping=True)),
     ):
         assert (settled.splits, settled.coarser) == (0, 0)
-    carved = needs(views, LeanModelConfig())
+    carved = analyze_scene(views, LeanModelConfig())
     assert (carved.splits, carved.coarser) == (1, 1)
     assert float(carved.grid().side) == pytest.approx(2 * carved.hull.side)
 

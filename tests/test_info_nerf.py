@@ -19,7 +19,7 @@ from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.data.synthetic.cameras import poses
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.resolve import planned
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
@@ -224,7 +224,9 @@ def trainer_of(method: str, **model: Any) -> Trainer:
     config = registered_methods()[method].specification.config
     views = tiny_views(4, 12, 10)
     small = replace(config.pipeline.model, **{"width": 8, "depth": 3, "num_coarse_samples": 6, **model})
-    config = planned(replace(config, max_num_iterations=10, pipeline=replace(config.pipeline, model=small)), views)
+    config = resolve_config(
+        replace(config, max_num_iterations=10, pipeline=replace(config.pipeline, model=small)), views
+    )
     return config.setup(run=RunFolder(Path("nowhere")), pipeline=Pipeline.build(config, views, "cpu"), preview=None)
 
 

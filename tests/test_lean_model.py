@@ -26,13 +26,13 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.models import lean
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.lean import JUDGE_EVERY, LeanModel
+from edge_se_sampler.models.lean import UPDATE_INTERVAL, LeanModel
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.hull import Hull
-from edge_se_sampler.occupancy.scene_analysis import live_pixels, needs
+from edge_se_sampler.occupancy.scene_analysis import analyze_scene, live_pixels
 
 RAYS = 12
-JUDGE_FROM = 2 * JUDGE_EVERY
+JUDGE_FROM = 2 * UPDATE_INTERVAL
 SIDE = 0.3
 
 
@@ -116,16 +116,16 @@ def test_rays_beside_the_scene_show_the_background_and_teach_nothing() -> None:
 
 
 def test_empty_cells_go_and_some_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean, "START", -20.0)  # nothing anywhere
+    monkeypatch.setattr(lean, "DENSITY_BIAS", -20.0)  # nothing anywhere
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert judged(model, JUDGE_FROM - JUDGE_EVERY) == before  # too early
+    assert judged(model, JUDGE_FROM - UPDATE_INTERVAL) == before  # too early
     assert judged(model, JUDGE_FROM + 1) == before  # not the time
     first = judged(model, JUDGE_FROM)
     assert 0 < first < 0.1 * before  # a fiftieth on average
     again = cells(model).occupied.clone()
-    judged(model, JUDGE_FROM + JUDGE_EVERY)
+    judged(model, JUDGE_FROM + UPDATE_INTERVAL)
     assert not torch.equal(again, cells(model).occupied)  # others
 
 
@@ -133,7 +133,7 @@ def test_what_was_seen_before_densities_mean_something_does_not_count() -> None:
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(2000), {"image": torch.ones(2000, 3).double()})
-    assert judged(model, JUDGE_EVERY) == before
+    assert judged(model, UPDATE_INTERVAL) == before
     assert judged(model, JUDGE_FROM) < 0.1 * before  # nothing was seen since
 
 
@@ -157,9 +157,9 @@ def test_without_features_there_is_the_network_alone() -> None:
     assert model.fine.layers[0].weight.grad.any()  # pyright: ignore
 
 
-@pytest.mark.parametrize("off", [{"cull_by_density": False}, {"economy": "off"}])
+@pytest.mark.parametrize("off", [{"cull_by_density": False}, {"empty_space_skipping": False}])
 def test_a_part_that_is_off_judges_nothing(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean, "START", -20.0)
+    monkeypatch.setattr(lean, "DENSITY_BIAS", -20.0)
     model = model_in(ball(), **off).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
@@ -270,7 +270,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
 
 def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
-    told = needs(read_blender(larger, "train"), trainer.config.pipeline.model)
+    told = analyze_scene(read_blender(larger, "train"), trainer.config.pipeline.model)
     assert (told.splits, told.silhouettes) == (1, 0)
     assert cells(trainer.pipeline.model).is_the_same_as(OccupancyGrid.of(told.hull, told.splits))
     views = trainer.pipeline.datamanager
@@ -292,23 +292,23 @@ def test_pixels_that_were_chosen_stay_chosen(by_alpha: bool, larger: Path, tmp_p
 def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_se: Any) -> None:
     flags = ["train", "lean-nerf", "--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "3"]
     for flag, value, word in (
-        ("--pipeline.model.cell-pixels", "0", "cell-pixels is 0.0"),
-        ("--pipeline.model.step-cells", "nan", "step-cells is nan"),
+        ("--pipeline.model.voxel-size-px", "0", "voxel-size-px is 0.0"),
+        ("--pipeline.model.step-size-voxels", "nan", "step-size-voxels is nan"),
         ("--pipeline.model.features", "-1", "features is -1"),
         ("--pipeline.model.features", "100000", "between 0 and 64"),
-        ("--pipeline.model.step-cells", "1e-6", "at least 0.05"),
-        ("--pipeline.model.cell-pixels", "1e300", "at most 1000"),
-        ("--revive", "True", "cannot die"),
-        ("--pipeline.datamanager.pixel-sampler.se-scoring", "coarse", "no coarse network"),
+        ("--pipeline.model.step-size-voxels", "1e-6", "at least 0.05"),
+        ("--pipeline.model.voxel-size-px", "1e300", "at most 1000"),
+        ("--reinit-dead", "True", "cannot die"),
+        ("--pipeline.datamanager.pixel-sampler.error-source", "coarse", "no coarse network"),
     ):
         answer = edge_se(*flags, flag, value)
         assert answer.code == 2, (flag, answer)
         assert word in answer.err
         assert answer.err.count("\n") == 1
     flags[1] = "edge-nerf"
-    answer = edge_se(*flags, "--pipeline.datamanager.live-pixels-only", "True")
+    answer = edge_se(*flags, "--pipeline.datamanager.skip-empty-rays", "True")
     assert answer.code == 2
-    assert "add --pipeline.model.economy auto" in answer.err
+    assert "add --pipeline.model.empty-space-skipping True" in answer.err
     assert not (tmp_path / "out").exists()
 
 
@@ -325,7 +325,7 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     answer = edge_se("inspect", "--data", larger, "--output-path", tmp_path / "inspect.png")
     assert answer.code == 0, answer
     said = dict(line.split(maxsplit=1) for line in answer.out.splitlines()[:-1])
-    told = needs(read_blender(larger, "train"), LeanModelConfig())
+    told = analyze_scene(read_blender(larger, "train"), LeanModelConfig())
     assert f"{told.hull.cells.sum():,} of" in said["cells"]
     assert said["silhouettes"].startswith("6 of 6 views")
     assert said["pixel"].startswith(f"{told.footprint:.4f}")
@@ -339,10 +339,15 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     assert said["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
-    large = needs(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
+    large = analyze_scene(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
     assert f"training begins with {large.hull.side:.4f}, split to {large.hull.side / 2:.4f} where" in unlocated
     assert f"training begins with {2 * told.hull.side:.4f}, split to {told.hull.side:.4f} where" in said["cells"]
     whole = large.hull.cells
     assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
-    for flag, value in (("--near", "7"), ("--cell-pixels", "0"), ("--step-cells", "inf"), ("--step-cells", "1e-5")):
+    for flag, value in (
+        ("--near", "7"),
+        ("--voxel-size-px", "0"),
+        ("--step-size-voxels", "inf"),
+        ("--step-size-voxels", "1e-5"),
+    ):
         assert edge_se("inspect", "--data", larger, flag, value).code == 2

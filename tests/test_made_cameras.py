@@ -1,4 +1,4 @@
-"""Made scenes: where the views look from, and the places of the object in them."""
+"""Synthetic scenes: where the views look from, and the places of the object in them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import DISTANCE, Placement, Split, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.data.synthetic.scene import Material, SceneBuilder
 
@@ -68,7 +68,7 @@ def test_test_cameras_are_spread() -> None:
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
 def test_shifted_and_padded_are_the_centred_picture_pasted(name: str) -> None:
-    scene = made_scene(name)
+    scene = synthetic_scene(name)
     pose = poses("train", 2)[1]
     size, frame = 40, 24
     places: list[tuple[Placement, int, int]] = [("shifted", 8, -6), ("padded", 0, 0)]
@@ -104,7 +104,7 @@ def test_rotated_shows_the_origin_where_shifted_does(size: int) -> None:
 def test_default_offset_clips_nothing_when_rotated(name: str) -> None:
     frame = framing(100, "rotated", (0.2, 0.15))
     for pose in (*poses("train", 2), poses("test", 1)[0]):
-        alpha = render(made_scene(name), frame.camera(pose))[..., 3]
+        alpha = render(synthetic_scene(name), frame.camera(pose))[..., 3]
         border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
         assert alpha.any()
         assert not border.any()

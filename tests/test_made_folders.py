@@ -1,4 +1,4 @@
-"""Made scenes: honest folders, refusals, and nothing left behind."""
+"""Synthetic scenes: honest folders, refusals, and nothing left behind."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 
 from edge_se_sampler.data.synthetic import ANALOG_OF, make_scenes, render_view
 from edge_se_sampler.data.synthetic.cameras import FIELD_OF_VIEW, Placement, Split, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
 
@@ -97,7 +97,7 @@ def test_processes_make_the_same_pictures(tmp_path: Path) -> None:
         for split, count in zip(SPLITS, (3, 1, 2), strict=True):
             for index, pose in enumerate(poses(split, count)):
                 picture = imageio.imread(tmp_path / f"new/out/{name}/{split}/r_{index}.png")
-                np.testing.assert_array_equal(picture, render(made_scene(name), framing(16).camera(pose)))
+                np.testing.assert_array_equal(picture, render(synthetic_scene(name), framing(16).camera(pose)))
 
 
 BAD_ARGUMENTS = [

@@ -1,4 +1,4 @@
-"""Made scenes: rays meet the solids where they are."""
+"""Synthetic scenes: rays meet the solids where they are."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from edge_se_sampler.data.synthetic import SCENE_NAMES, render_view
 from edge_se_sampler.data.synthetic.cameras import DISTANCE, Camera, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.linear import inverse_affine, rotation, unit
 from edge_se_sampler.data.synthetic.render import SAMPLES_PER_AXIS, render
 from edge_se_sampler.data.synthetic.scene import BALL_RADIUS, Material, Scene, SceneBuilder
@@ -138,7 +138,7 @@ def assert_first_hits_are_brute_force(scene: Scene, camera: Camera) -> np.ndarra
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
 def test_bounds_change_no_answer(name: str) -> None:
-    scene = made_scene(name)
+    scene = synthetic_scene(name)
     camera = framing(40, "rotated", OFFSET).camera(poses("train", 5)[4])
     points = assert_first_hits_are_brute_force(scene, camera)[:, :200]
     toward_light = np.repeat(KEY_DIRECTION[:, None], points.shape[1], axis=1)
@@ -155,7 +155,7 @@ def test_bounds_change_no_answer(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
 def test_the_whole_scene_is_in_the_ball(name: str) -> None:
-    scene = made_scene(name)
+    scene = synthetic_scene(name)
     angle = np.linspace(0, 2 * np.pi, 33)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     height = np.linspace(-1, 1, 17)
@@ -215,7 +215,7 @@ def test_a_solid_behind_the_camera_is_not_seen() -> None:
 
 
 def test_a_camera_amid_the_scene_sees_what_is_around_it() -> None:
-    scene = made_scene("hotdog")
+    scene = synthetic_scene("hotdog")
     pose = poses("train", 1)[0].copy()
     pose[:3, 3] = (0.0, 0.1, 0.3)
     camera = Camera(pose, 12.0, (16.0, 16.0), 32, 32)

@@ -1,4 +1,4 @@
-"""Made scenes: the same pixels everywhere."""
+"""Synthetic scenes: the same pixels everywhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import framing, poses
-from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.linear import unit
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.data.synthetic.shading import radiance
@@ -38,12 +38,12 @@ def digest(*arrays: np.ndarray) -> str:
 
 
 def small_picture(name: str) -> np.ndarray:
-    return render(made_scene(name), framing(32).camera(poses("train", 1)[0]))
+    return render(synthetic_scene(name), framing(32).camera(poses("train", 1)[0]))
 
 
 def float_digest(name: str) -> str:
     """Of every float64 on the way to the pixels: an eighth bit hides most differences, these bits hide none."""
-    scene = made_scene(name)
+    scene = synthetic_scene(name)
     camera = framing(48).camera(poses("val", 2)[1])
     depth, seen = first_hits(scene, camera, 1)
     rows, columns = np.nonzero(seen >= 0)

@@ -120,7 +120,7 @@ class TestPixels:
 class TestCameras:
     @pytest.fixture
     def folders(self, tmp_path: Path) -> list[Path]:
-        """A made scene, its centred and its shifted twin."""
+        """A synthetic scene, its centred and its shifted twin."""
         made = make_scenes(tmp_path, ["mic"], size=20, num_train=2, num_val=1, num_test=1, placement="centered")
         return [*made, *offcenter(made[0], tmp_path / "out")]
 

@@ -7,7 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from edge_se_sampler.models.packed_rendering import render_packed, spread, sum_rays, transmittance
+from edge_se_sampler.models.packed_rendering import (
+    accumulate_along_rays,
+    expand_to_samples,
+    render_packed,
+    transmittance,
+)
 from edge_se_sampler.models.rendering import composite, sample_weights
 
 STEP = 0.13
@@ -58,7 +63,7 @@ def test_gradients_against_finite_differences() -> None:
     inputs = (density.requires_grad_(), color.requires_grad_())
     assert torch.autograd.gradcheck(lambda d, c: render_packed(d, c, STEP, first, ray), inputs)
     values = torch.randn(3, 4, dtype=torch.float64, requires_grad=True, generator=torch.Generator().manual_seed(0))
-    assert torch.autograd.gradcheck(lambda v: spread(v, first, ray), (values,))
+    assert torch.autograd.gradcheck(lambda v: expand_to_samples(v, first, ray), (values,))
 
 
 def test_rays_do_not_see_each_other() -> None:
@@ -92,5 +97,5 @@ def test_no_samples_at_all() -> None:
 def test_sums_along_rays() -> None:
     _, color, first, ray = packed([3, 0, 5, 1])
     expected = torch.zeros(4, 3).double().index_add_(0, ray, color)
-    torch.testing.assert_close(sum_rays(color, first), expected)
-    torch.testing.assert_close(spread(expected, first, ray), expected[ray])
+    torch.testing.assert_close(accumulate_along_rays(color, first), expected)
+    torch.testing.assert_close(expand_to_samples(expected, first, ray), expected[ray])

@@ -12,7 +12,7 @@ from tiny import tiny_views
 
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.resolve import planned
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import NeRFModelConfig
 
@@ -41,17 +41,17 @@ def config_with(flag: str, value: Any) -> TrainerConfig:
      (800, 800, "paper")],
 )  # fmt: skip
 def test_the_longer_side_decides_the_size(height: int, width: int, size: str) -> None:
-    assert planned(TrainerConfig(), of_size(height, width)).pipeline.model.size == size
+    assert resolve_config(TrainerConfig(), of_size(height, width)).pipeline.model.size == size
 
 
 def test_the_largest_image_decides() -> None:
     images = tuple(np.zeros((side, 10, 3), dtype=np.uint8) for side in (20, 300, 40))
     views = dataclasses.replace(tiny_views(3), images=images)
-    assert planned(TrainerConfig(), views).pipeline.model.size == "paper"
+    assert resolve_config(TrainerConfig(), views).pipeline.model.size == "paper"
 
 
 def test_the_papers_size_is_the_papers() -> None:
-    plan = planned(config_with("pipeline.model.size", "paper"), of_size(8, 8))
+    plan = resolve_config(config_with("pipeline.model.size", "paper"), of_size(8, 8))
     model = plan.pipeline.model
     assert isinstance(model, NeRFModelConfig)
     assert (model.depth, model.width) == (8, 256)
@@ -63,7 +63,7 @@ def test_the_papers_size_is_the_papers() -> None:
 
 @pytest.mark.parametrize("size", ["auto", "paper", "small", "tiny"])
 def test_nothing_is_left_open(size: Any) -> None:
-    plan = planned(config_with("pipeline.model.size", size), of_size(8, 8))
+    plan = resolve_config(config_with("pipeline.model.size", size), of_size(8, 8))
 
     def left_open(config: Any) -> list[str]:
         fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
@@ -77,7 +77,9 @@ def test_nothing_is_left_open(size: Any) -> None:
         "views",
         "max_seconds",
     ]  # the machine's, and None has a meaning
-    assert planned(plan, of_size(800, 800)) == plan  # planning what is planned changes nothing, whatever the data
+    assert (
+        resolve_config(plan, of_size(800, 800)) == plan
+    )  # planning what is planned changes nothing, whatever the data
 
 
 @pytest.mark.parametrize(
@@ -94,8 +96,11 @@ def test_nothing_is_left_open(size: Any) -> None:
     ],
 )
 def test_what_was_given_stays(flag: str, value: Any) -> None:
-    given, free = planned(config_with(flag, value), of_size(8, 8)), planned(TrainerConfig(), of_size(8, 8))
-    assert given == planned(given, of_size(8, 8))
+    given, free = (
+        resolve_config(config_with(flag, value), of_size(8, 8)),
+        resolve_config(TrainerConfig(), of_size(8, 8)),
+    )
+    assert given == resolve_config(given, of_size(8, 8))
     found: Any = given
     for name in flag.replace("-", "_").split("."):
         found = getattr(found, name)
@@ -105,20 +110,20 @@ def test_what_was_given_stays(flag: str, value: Any) -> None:
 
 def test_the_given_config_is_not_changed() -> None:
     config = TrainerConfig()
-    planned(config, of_size(8, 8))
+    resolve_config(config, of_size(8, 8))
     assert config == TrainerConfig()
     assert config.pipeline.model.width is None
 
 
 def test_the_experiment_is_named_after_the_data(tmp_path: Path) -> None:
     (tmp_path / "lego").mkdir()
-    assert planned(config_with("data", tmp_path / "lego"), of_size(8, 8)).experiment_name == "lego"
-    assert planned(config_with("data", tmp_path / "lego" / "x" / ".."), of_size(8, 8)).experiment_name == "lego"
+    assert resolve_config(config_with("data", tmp_path / "lego"), of_size(8, 8)).experiment_name == "lego"
+    assert resolve_config(config_with("data", tmp_path / "lego" / "x" / ".."), of_size(8, 8)).experiment_name == "lego"
 
 
 def test_a_preview_is_due_ten_times() -> None:
     for iterations, every in ((2000, 200), (25, 2), (9, 1), (1, 1)):
-        plan = planned(config_with("max-num-iterations", iterations), of_size(8, 8))
+        plan = resolve_config(config_with("max-num-iterations", iterations), of_size(8, 8))
         assert plan.steps_per_eval_image == every
 
 
@@ -148,7 +153,7 @@ REFUSED = [
 @pytest.mark.parametrize(("flag", "value"), [(flag, value) for flag, values in REFUSED for value in values])
 def test_a_value_without_meaning_is_refused_by_its_flag(flag: str, value: Any) -> None:
     with pytest.raises(InputError) as refusal:
-        planned(config_with(flag, value), of_size(8, 8))
+        resolve_config(config_with(flag, value), of_size(8, 8))
     assert f"--{flag}" in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
@@ -156,12 +161,12 @@ def test_a_value_without_meaning_is_refused_by_its_flag(flag: str, value: Any) -
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_an_endless_epsilon_is_refused(value: float) -> None:
     with pytest.raises(InputError, match=r"--optimizer\.eps"):
-        planned(config_with("optimizer.eps", value), of_size(8, 8))
+        resolve_config(config_with("optimizer.eps", value), of_size(8, 8))
 
 
 def test_a_width_that_leaves_the_direction_no_neuron_is_refused() -> None:
     with pytest.raises(InputError, match=r"--pipeline\.model\.width"):
-        planned(config_with("pipeline.model.width", 1), of_size(8, 8))
+        resolve_config(config_with("pipeline.model.width", 1), of_size(8, 8))
 
 
 @pytest.mark.parametrize(
@@ -178,4 +183,4 @@ def test_a_width_that_leaves_the_direction_no_neuron_is_refused() -> None:
     ],
 )
 def test_the_ends_of_a_range_are_taken(flag: str, value: Any) -> None:
-    planned(config_with(flag, value), of_size(8, 8))
+    resolve_config(config_with(flag, value), of_size(8, 8))

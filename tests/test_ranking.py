@@ -12,7 +12,7 @@ import torch
 from goodness import ALPHA, mean_is, p_value
 
 from edge_se_sampler.sampling import ranking
-from edge_se_sampler.sampling.ranking import error_ranks, keep_by_rank
+from edge_se_sampler.sampling.ranking import error_ranks, sample_by_rank
 
 Ranking = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
@@ -76,7 +76,7 @@ def fits_equation_7(monkeypatch: pytest.MonkeyPatch, ranks: Ranking) -> bool:
     monkeypatch.setattr(ranking, "error_ranks", ranks)
     errors = torch.tensor([0.4, 0.1, 0.5, 0.2, 0.3])
     rng = np.random.default_rng(0)
-    kept = np.bincount([int(keep_by_rank(errors, 1, rng).rows) for _ in range(5_000)], minlength=5)
+    kept = np.bincount([int(sample_by_rank(errors, 1, rng).rows) for _ in range(5_000)], minlength=5)
     return p_value(kept, np.array([4, 1, 5, 2, 3]) / 15) > ALPHA
 
 
@@ -110,7 +110,7 @@ def fits_closed_form(monkeypatch: pytest.MonkeyPatch, ranks: Ranking) -> bool:
     for _ in range(TRIALS):
         true_rank = rng.permutation(M)
         errors = torch.from_numpy((true_rank / M) ** 4)  # skewed, as errors are
-        kept[true_rank[keep_by_rank(errors, M // 2, rng).rows.numpy()]] += 1
+        kept[true_rank[sample_by_rank(errors, M // 2, rng).rows.numpy()]] += 1
     counted = kept.reshape(BINS, -1).sum(axis=1)
     expected = TRIALS * INCLUSION.reshape(BINS, -1).sum(axis=1)
     spread = np.sqrt(TRIALS * (INCLUSION * (1 - INCLUSION)).reshape(BINS, -1).sum(axis=1))
@@ -132,7 +132,7 @@ def test_half_of_many_would_show_a_wrong_rank(wrong: str, monkeypatch: pytest.Mo
 def test_exactly_n_different_rows_in_order(count: int, keep: int) -> None:
     errors = torch.rand(count, generator=torch.Generator().manual_seed(0))
     before = errors.clone()
-    kept = keep_by_rank(errors, keep, np.random.default_rng(0))
+    kept = sample_by_rank(errors, keep, np.random.default_rng(0))
     rows = kept.rows.tolist()
     assert len(rows) == keep
     assert rows == sorted(set(rows))
@@ -146,7 +146,7 @@ def test_exactly_n_different_rows_in_order(count: int, keep: int) -> None:
 
 
 def test_whoever_keeps_all_keeps_each_for_certain() -> None:
-    kept = keep_by_rank(torch.rand(50), 50, np.random.default_rng(0))
+    kept = sample_by_rank(torch.rand(50), 50, np.random.default_rng(0))
     assert kept.rows.tolist() == list(range(50))
     assert kept.inclusion.tolist() == [1.0] * 50
 
@@ -154,7 +154,7 @@ def test_whoever_keeps_all_keeps_each_for_certain() -> None:
 @pytest.mark.parametrize("keep", [0, -1, 6, 100])
 def test_n_out_of_range_is_refused(keep: int) -> None:
     with pytest.raises(ValueError, match=f"cannot keep {keep} of 5"):
-        keep_by_rank(torch.rand(5), keep, np.random.default_rng(0))
+        sample_by_rank(torch.rand(5), keep, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -163,19 +163,19 @@ def test_an_error_that_is_not_finite_is_an_error(bad: float, where: list[int]) -
     errors = torch.rand(5)
     errors[where] = bad
     with pytest.raises(FloatingPointError, match=f"{len(where)} of 5 candidates are not finite"):
-        keep_by_rank(errors, 2, np.random.default_rng(0))
+        sample_by_rank(errors, 2, np.random.default_rng(0))
 
 
 def test_the_largest_float32_is_finite() -> None:
     errors = torch.tensor([0.0, torch.finfo(torch.float32).max])
-    kept = [int(keep_by_rank(errors, 1, np.random.default_rng(seed)).rows) for seed in range(300)]
+    kept = [int(sample_by_rank(errors, 1, np.random.default_rng(seed)).rows) for seed in range(300)]
     assert p_value(np.bincount(kept, minlength=2), np.array([1 / 3, 2 / 3])) > ALPHA
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
 def test_the_same_generator_keeps_the_same(dtype: torch.dtype) -> None:
     errors = torch.arange(60).flip(0).to(dtype).requires_grad_()
-    first, second = (keep_by_rank(errors, 20, np.random.default_rng(3)) for _ in range(2))
+    first, second = (sample_by_rank(errors, 20, np.random.default_rng(3)) for _ in range(2))
     assert torch.equal(first.rows, second.rows)
     assert torch.equal(first.inclusion, second.inclusion)
     assert not first.inclusion.requires_grad
@@ -184,14 +184,14 @@ def test_the_same_generator_keeps_the_same(dtype: torch.dtype) -> None:
 # ---- weights
 
 
-def weighted_means(weight: Callable[[ranking.Kept, np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
+def weighted_means(weight: Callable[[ranking.Selection, np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
     """Weighted means over 10 kept of 20 candidates of a value that grows with the error, and the plain mean of all."""
     value = np.linspace(0, 1, 20) ** 2
     errors, rng = torch.from_numpy(value), np.random.default_rng(0)
     p = np.arange(1, 21) / 210
     means = np.empty(8_000)
     for i in range(len(means)):
-        kept = keep_by_rank(errors, 10, rng)
+        kept = sample_by_rank(errors, 10, rng)
         means[i] = (weight(kept, p) * value[kept.rows.numpy()]).sum() / 20
     return means, float(value.mean())
 

@@ -29,7 +29,7 @@ from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
 what, place, data, interrupt_at, method = sys.argv[1:]
 place, data, interrupt_at = Path(place), Path(data), int(interrupt_at)
-lean.JUDGE_EVERY, lean.LEAST_OPACITY, lean.SOLID = 5, 0.001, 0.0
+lean.UPDATE_INTERVAL, lean.ALPHA_THRESHOLD, lean.MIN_OPTICAL_DEPTH = 5, 0.001, 0.0
 if what == "resume":
     trainer = prepare_resume(RunFolder(place))
 else:
@@ -37,9 +37,9 @@ else:
     changes = {"early_fraction": 0.7}
     samples = {"num_coarse_samples": 8, "num_importance_samples": 8, "density_noise": 0.1}
     if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered
-        changes, samples = {"early": "edge", "late": "se", "se_scoring": "memory", "early_fraction": 0.3}, {}
+        changes, samples = {"early": "edge", "late": "se", "error_source": "cached", "early_fraction": 0.3}, {}
     if "without alpha" in method:  # where the early phase is decided again, and watched, and cells are split
-        changes, samples = {}, {"cull_by_alpha": False, "cell_pixels": 0.1 if "twice" in method else 0.4}
+        changes, samples = {}, {"cull_by_alpha": False, "voxel_size_px": 0.1 if "twice" in method else 0.4}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **changes)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
     model = replace(config.pipeline.model, **samples)

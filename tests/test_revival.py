@@ -16,7 +16,7 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.reinitialization import PATIENCE, dead_networks
-from edge_se_sampler.engine.resolve import planned
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import STRATEGIES, registered_methods
@@ -27,7 +27,7 @@ VIEWS = tiny_views(3, 12, 12)
 
 
 def trainer_of(
-    folder: Path, method: str = "vanilla-nerf", *, revive: bool = True, seed: int = 0, schedule: str = "fraction"
+    folder: Path, method: str = "vanilla-nerf", *, reinit_dead: bool = True, seed: int = 0, schedule: str = "fraction"
 ) -> Trainer:
     config: TrainerConfig = registered_methods()[method].specification.config
     settings: dict[str, Any] = {"schedule": schedule}
@@ -35,8 +35,8 @@ def trainer_of(
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=16, pixel_sampler=sampler)
     pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(width=16, depth=2))
     machine = replace(config.machine, seed=seed)
-    config = replace(config, pipeline=pipeline, max_num_iterations=400, machine=machine, revive=revive)
-    config = planned(replace(config, output_dir=folder, experiment_name="e"), VIEWS)
+    config = replace(config, pipeline=pipeline, max_num_iterations=400, machine=machine, reinit_dead=reinit_dead)
+    config = resolve_config(replace(config, output_dir=folder, experiment_name="e"), VIEWS)
     return config.setup(run=RunFolder.create(config), pipeline=Pipeline.build(config, VIEWS, "cpu"), preview=None)
 
 
@@ -93,7 +93,7 @@ def test_only_the_dead_one_begins_anew(dead: str, tmp_path: Path) -> None:
 
 def test_without_it_the_dead_stay_dead(tmp_path: Path) -> None:
     """The negative control, and what the faithful methods do."""
-    trainer = trainer_of(tmp_path, "edge-se-nerf", revive=False)
+    trainer = trainer_of(tmp_path, "edge-se-nerf", reinit_dead=False)
     kill(trainer.pipeline.model, "coarse", "fine")
     before = weights(trainer.pipeline.model, "fine")
     for step in range(3 * PATIENCE):
@@ -104,7 +104,7 @@ def test_without_it_the_dead_stay_dead(tmp_path: Path) -> None:
 
 def test_the_living_are_left_alone(tmp_path: Path) -> None:
     """Empty batches have no density gradient either; the probe tells."""
-    trainer, plain = trainer_of(tmp_path), trainer_of(tmp_path, revive=False)
+    trainer, plain = trainer_of(tmp_path), trainer_of(tmp_path, reinit_dead=False)
     for step in range(2 * PATIENCE):
         assert trainer.train_iteration(step) == plain.train_iteration(step)
     revival = trainer.revival
@@ -173,7 +173,7 @@ def test_a_checkpoint_remembers_what_auto_has_seen(
     monkeypatch.setattr(schedule, "PAYS_NO_MORE", float("inf"))
     monkeypatch.setattr(schedule, "LEARNT", 1e6)
     monkeypatch.setattr(schedule, "LOST", 0.0)
-    trainer = trainer_of(tmp_path, "edge-se-nerf", schedule="auto")
+    trainer = trainer_of(tmp_path, "edge-se-nerf", schedule="adaptive")
     sampler: Any = trainer.pipeline.datamanager.train_pixel_sampler
     for step in range(saved_after):
         trainer.train_iteration(step)

@@ -24,7 +24,7 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
         ("importance-weight", {"importance_weight": 0.5, "early": early, "late": "uniform"})
         for early in ("uniform", "precrop")
     ],
-    *[("se-scoring", {"se_scoring": scoring, "late": "uniform"}) for scoring in ("coarse", "memory")],
+    *[("error-source", {"error_source": scoring, "late": "uniform"}) for scoring in ("coarse", "cached")],
 ]
 
 
@@ -51,7 +51,7 @@ def test_a_sampler_refuses_them_when_it_is_made(flag: str, settings: dict[str, A
         {"early_fraction": 0},
         {"early_fraction": 1},
         {"schedule": "steps", "early_steps": 1},
-        {"schedule": "auto"},
+        {"schedule": "adaptive"},
         {"edge_epsilon": 1e-6},
         {"edge_epsilon": 1e6},
         {"se_candidates": 2},
@@ -72,7 +72,7 @@ def test_accepted_to_the_very_limits(settings: dict[str, Any]) -> None:
     [
         ({"early": "auto"}, True, "uniform", "fraction"),
         ({"early": "auto"}, False, "edge", "auto"),
-        ({"early": "auto", "schedule": "auto"}, True, "edge", "auto"),  # somebody wants to watch
+        ({"early": "auto", "schedule": "adaptive"}, True, "edge", "adaptive"),  # somebody wants to watch
         ({"early": "precrop"}, True, "precrop", "fraction"),
         ({"early": "uniform"}, False, "uniform", "fraction"),
     ],
@@ -81,7 +81,7 @@ def test_what_is_automatic_is_decided_by_whether_the_object_is_located(
     settings: dict[str, Any], located: bool, early: str, schedule: str
 ) -> None:
     config = EdgeSEPixelSamplerConfig(**settings)
-    decided = config.decided(located)
+    decided = config.resolve_auto(located)
     assert (decided.early, decided.schedule) == (early, schedule)
     decided.check()
     if not located:  # nor does a sampler know by itself

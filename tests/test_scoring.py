@@ -87,7 +87,7 @@ def test_the_coarse_errors_are_those_of_the_whole_rendering(training: bool) -> N
 
 def test_coarse_scoring_never_asks_the_fine_network(monkeypatch: pytest.MonkeyPatch) -> None:
     def manager_of(how: Any) -> Any:
-        config = EdgeSEPixelSamplerConfig(se_scoring=how)
+        config = EdgeSEPixelSamplerConfig(error_source=how)
         return VanillaDataManagerConfig(train_num_rays_per_batch=64, pixel_sampler=config).setup(
             views=tiny_views(3, 9, 14)
         )
@@ -95,7 +95,7 @@ def test_coarse_scoring_never_asks_the_fine_network(monkeypatch: pytest.MonkeyPa
     model = tiny_model().float()
     batch = {"image": torch.rand((9, 4))}
     rays = tiny_rays(9, dtype=torch.float32)
-    exact = manager_of("exact").ray_errors(model, rays, batch)
+    exact = manager_of("fine").ray_errors(model, rays, batch)
     assert not torch.equal(exact, manager_of("coarse").ray_errors(model, rays, batch))
 
     def asked(*_: Any) -> None:
@@ -104,4 +104,4 @@ def test_coarse_scoring_never_asks_the_fine_network(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(model.fine, "forward", asked)
     assert manager_of("coarse").ray_errors(model, rays, batch).shape == (9,)
     with pytest.raises(AssertionError, match="the fine network"):
-        manager_of("exact").ray_errors(model, rays, batch)
+        manager_of("fine").ray_errors(model, rays, batch)

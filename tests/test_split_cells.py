@@ -14,13 +14,13 @@ from torch import Tensor
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models import lean
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.lean import JUDGE_EVERY, SOLID, LeanModel
+from edge_se_sampler.models.lean import MIN_OPTICAL_DEPTH, UPDATE_INTERVAL, LeanModel
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.hull import Hull
 
 RAYS = 12
 SIDE = 0.3
-EARLY = JUDGE_EVERY // 2
+EARLY = UPDATE_INTERVAL // 2
 
 
 def open_model(splits: int = 1, **changes: Any) -> LeanModel:
@@ -40,7 +40,7 @@ def seen(model: LeanModel, density: float) -> Tensor:
 
 
 def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_otherwise() -> None:
-    model = open_model(step_cells=0.5)
+    model = open_model(step_size_voxels=0.5)
     with torch.no_grad():
         model.features.table.normal_(generator=torch.Generator().manual_seed(0))  # pyright: ignore
     where = seen(model, 100.0)
@@ -53,7 +53,7 @@ def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_other
     assert torch.equal(model.features.owned, owned)  # pyright: ignore
     assert bool(cells(model).occupied[owned].all())
     cells(model).occupied.copy_(cells(model).possible)
-    model.config = replace(model.config, step_cells=1.0)  # as long a step as before
+    model.config = replace(model.config, step_size_voxels=1.0)  # as long a step as before
     for key, value in model.eval()(tiny_rays(RAYS)).items():
         torch.testing.assert_close(value, before[key], rtol=0, atol=1e-9)
 
@@ -79,7 +79,7 @@ def test_split_cells_are_none_but_the_hulls() -> None:
 @pytest.mark.parametrize("reason", ["nothing is solid", "no splits left", "not the time"])
 def test_cells_stay_large(reason: str) -> None:
     model = open_model(0 if reason == "no splits left" else 1)
-    seen(model, 0.9 * SOLID / SIDE if reason == "nothing is solid" else 100.0)
+    seen(model, 0.9 * MIN_OPTICAL_DEPTH / SIDE if reason == "nothing is solid" else 100.0)
     before = int(cells(model).occupied.sum())
     assert judged(model, 3 * EARLY + 1 if reason == "not the time" else 2 * EARLY) == before
     assert cells(model).splits[0] == 0
@@ -87,7 +87,7 @@ def test_cells_stay_large(reason: str) -> None:
 
 @pytest.mark.parametrize("room", [6**3, 6**3 - 1])
 def test_cells_are_split_again_once_they_are_few_enough(room: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean, "MOST_CELLS", room)
+    monkeypatch.setattr(lean, "MAX_OCCUPIED_CELLS", room)
     model = open_model(2)
     for step in (2, 3):
         seen(model, 100.0)
@@ -104,11 +104,11 @@ def test_what_was_left_out_by_mistake_is_tried_again_found_and_split() -> None:
     assert not bool(owned[elsewhere])
     tried = torch.zeros_like(owned)
     for again in range(3, 200):
-        judged(model, again * JUDGE_EVERY)
+        judged(model, again * UPDATE_INTERVAL)
         tried |= cells(model).occupied
     assert bool(tried[cells(model).possible].float().mean() > 0.8)
     cells(model).largest[elsewhere] = 100.0
-    judged(model, 200 * JUDGE_EVERY)
+    judged(model, 200 * UPDATE_INTERVAL)
     assert bool(cells(model).occupied[elsewhere])
     assert bool(model.features.owned[elsewhere])
     assert torch.equal(model.features.owned & owned, owned)

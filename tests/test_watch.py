@@ -11,19 +11,21 @@ import pytest
 import torch
 from batches import batch_of, following
 
-from edge_se_sampler.bench.paper.scenes import made_scenes
+from edge_se_sampler.bench.paper.scenes import synthetic_scenes
 from edge_se_sampler.bench.paper.trials import PRESETS
 from edge_se_sampler.bench.schedule.trials import Cell, settings_of
 from edge_se_sampler.bench.train import trial
 from edge_se_sampler.sampling.background import PlainBackgrounds, summed_up
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels
 from edge_se_sampler.sampling.image_batch import ImageBatch
-from edge_se_sampler.sampling.schedule import LEARNT, LOST, PAYS_AGAIN, PAYS_NO_MORE, WINDOW_STEPS, Watch
+from edge_se_sampler.sampling.schedule import LEARNT, LOST, PAYS_AGAIN, PAYS_NO_MORE, WINDOW_STEPS, AdaptiveSchedule
 
 
-def phases(remaining: Any, count: int = 64, noise: float = 0.0, watch: Watch | None = None, gain: float = 1.0) -> Any:
+def phases(
+    remaining: Any, count: int = 64, noise: float = 0.0, watch: AdaptiveSchedule | None = None, gain: float = 1.0
+) -> Any:
     """The phase after each step of a trace of R, the error as a share of an empty scene's; gain is E[e] / U[e]."""
-    watch, rng = watch or Watch(), np.random.default_rng(0)
+    watch, rng = watch or AdaptiveSchedule(), np.random.default_rng(0)
     told = []
     for share in remaining:
         background = float(rng.uniform(0.2, 0.8)) if noise else 0.5  # images differ
@@ -67,13 +69,13 @@ def test_noise_does_not_throw_it_about() -> None:
 def test_between_the_bounds_a_phase_stays_what_it_was() -> None:
     middle = np.full(500, (LEARNT + LOST) / 2)
     assert set(phases(middle)) == {"early"}
-    watch = Watch()
+    watch = AdaptiveSchedule()
     phases(np.full(100, 0.2), watch=watch)
     assert set(phases(middle, watch=watch)) == {"late"}
 
 
 def test_steps_without_the_object_tell_nothing() -> None:
-    watch = Watch()
+    watch = AdaptiveSchedule()
     for _ in range(1000):
         watch.observe(0, 0.0, 0.0, 0.0)
     assert watch.phase == "early"
@@ -93,7 +95,7 @@ def test_a_fog_is_not_an_object() -> None:
     error, distance = np.array([0.5] * 10 + [0.7] * 30), np.array([2.0] * 10 + [0.0] * 30)
     said = summed_up(error, distance, np.ones(40), True)
     assert error[:10].mean() < 0.5 * distance[:10].mean()
-    watch = Watch()
+    watch = AdaptiveSchedule()
     for _ in range(500):
         watch.observe(*said)
     assert watch.phase == "early"
@@ -106,7 +108,7 @@ def test_edges_last_while_they_pay() -> None:
 
 
 def test_edges_begin_again_when_they_pay_again() -> None:
-    watch = Watch()
+    watch = AdaptiveSchedule()
     assert phases(np.full(100, 0.2), watch=watch)[-1] == "late"
     assert set(phases(np.full(100, 0.2), watch=watch, gain=PAYS_AGAIN - 0.1)) == {"late"}
     assert phases(np.full(100, 0.2), watch=watch, gain=PAYS_AGAIN + 0.1)[-1] == "early"
@@ -116,7 +118,7 @@ def test_it_goes_on_from_a_state() -> None:
     trace = np.concatenate((np.linspace(1, 0.2, 40), np.full(60, 1.0), np.full(60, 0.3)))
     whole = phases(trace)
     for cut in range(0, 160, 7):  # in the middle of every phase
-        first, second = Watch(), Watch()
+        first, second = AdaptiveSchedule(), AdaptiveSchedule()
         begun = phases(trace[:cut], watch=first)
         second.load(first.state())
         assert begun + phases(trace[cut:], watch=second) == whole, cut
@@ -189,7 +191,7 @@ def test_both_ways_of_drawing_tell_the_same() -> None:
 
 
 def auto(**settings: Any) -> Any:
-    return following(schedule="auto", rays=64, **settings)
+    return following(schedule="adaptive", rays=64, **settings)
 
 
 def away(image: torch.Tensor) -> torch.Tensor:
@@ -249,14 +251,14 @@ def test_other_schedules_watch_nothing() -> None:
     sampler.sample(batch_of(channels=4))
     sampler.observe(torch.ones(64))
     assert sampler.watch is None
-    assert sampler.trained_on is None
+    assert sampler.pending_batch is None
     assert sampler.strategy == "se"
 
 
 # -- negative controls: schedules that do not watch
 
 
-class Stuck(Watch):
+class Stuck(AdaptiveSchedule):
     """Never leaves its early phase."""
 
     def observe(self, count: float, edge_error: float, edge_background: float, uniform_error: float) -> None:
@@ -264,7 +266,7 @@ class Stuck(Watch):
         self.phase = "early"
 
 
-class Hasty(Watch):
+class Hasty(AdaptiveSchedule):
     """Leaves at once."""
 
     def observe(self, count: float, edge_error: float, edge_background: float, uniform_error: float) -> None:
@@ -272,7 +274,7 @@ class Hasty(Watch):
         self.phase = "late"
 
 
-def watches(kind: type[Watch]) -> bool:
+def watches(kind: type[AdaptiveSchedule]) -> bool:
     """Whether it leaves when the object is learnt, stays while it is not, and comes back when it is lost."""
     learnt, never, lost = kind(), kind(), kind()
     return (
@@ -283,7 +285,7 @@ def watches(kind: type[Watch]) -> bool:
 
 
 def test_schedules_that_do_not_watch_are_caught() -> None:
-    assert watches(Watch)
+    assert watches(AdaptiveSchedule)
     assert not watches(Stuck)
     assert not watches(Hasty)
 
@@ -294,7 +296,7 @@ def test_staying_and_leaving_at_once_cost_what_auto_saves(tmp_path: Path) -> Non
 
     def trained(table: int, scene: str, **settings: Any) -> dict[str, Any]:
         cell = Cell("lengths", table, scene, 300, "auto", 100)
-        config = settings_of(cell, made_scenes(PRESETS["cpu"], [cell], tmp_path)(cell), tmp_path / "runs")
+        config = settings_of(cell, synthetic_scenes(PRESETS["cpu"], [cell], tmp_path)(cell), tmp_path / "runs")
         manager = config.pipeline.datamanager
         manager = replace(manager, pixel_sampler=replace(manager.pixel_sampler, **settings))
         return trial(replace(config, pipeline=replace(config.pipeline, datamanager=manager)))

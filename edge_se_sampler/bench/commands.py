@@ -81,7 +81,7 @@ class BenchScoring:
 
 @dataclass(frozen=True)
 class BenchQuality:
-    """Train a method on a made scene for some minutes; leave result.json and curve.png."""
+    """Train a method on a synthetic scene for some minutes; leave result.json and curve.png."""
 
     output_dir: Path
     """Where the result goes."""
@@ -166,7 +166,7 @@ class BenchPaper(_Parallel):
     output_dir: Path
     """Where the result goes; cells that it already has are kept."""
     preset: Literal["cpu", "paper"] = "cpu"
-    """Made scenes, small enough for a CPU; or the paper's own size, for --data."""
+    """Synthetic scenes, small enough for a CPU; or the paper's own size, for --data."""
     data: Path | None = None
     """A NeRF-synthetic folder (chair, drums, ficus, hotdog, lego, materials, mic), for --preset paper."""
     workplace: Path = Path("bench")
@@ -186,7 +186,7 @@ class BenchPaper(_Parallel):
         from edge_se_sampler.bench.paper.estimate import plan_of
         from edge_se_sampler.bench.paper.outputs import keep_view, write_outputs
         from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
-        from edge_se_sampler.bench.paper.scenes import check_real, made_scenes, real_scenes
+        from edge_se_sampler.bench.paper.scenes import check_real, real_scenes, synthetic_scenes
         from edge_se_sampler.bench.paper.trials import PRESETS, TABLES, cells, run_cell
         from edge_se_sampler.bench.runner import begun, executor_of, missing, run_cells
         from edge_se_sampler.engine.files import make_folder
@@ -215,7 +215,7 @@ class BenchPaper(_Parallel):
         new_executor = executor_of(workers, self.scheduler)
         make_folder(self.output_dir / "views", "--output-dir")
         if self.data is None:
-            data_of = made_scenes(preset, todo, self.workplace)
+            data_of = synthetic_scenes(preset, todo, self.workplace)
         else:
             data_of = real_scenes(self.data, todo, self.workplace)
         run_cells(
@@ -295,7 +295,7 @@ class BenchSchedule(_Parallel):
     """Of the runs over planned lengths; the fixed length is chosen on others."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.paper.scenes import made_scenes
+        from edge_se_sampler.bench.paper.scenes import synthetic_scenes
         from edge_se_sampler.bench.paper.trials import PRESETS
         from edge_se_sampler.bench.runner import begun, executor_of, run_cells
         from edge_se_sampler.bench.schedule.summary import best_shares, write_outputs
@@ -324,7 +324,7 @@ class BenchSchedule(_Parallel):
         new_executor = executor_of(workers, self.scheduler)
         make_folder(self.output_dir, "--output-dir")
         lengths = LENGTHS if "lengths" in self.parts else ()
-        data_of = made_scenes(
+        data_of = synthetic_scenes(
             PRESETS["cpu"], [*todo, *(cell for length in lengths for cell in choice_cells(length))], self.workplace
         )
         runs, errors = self.workplace / "runs", []

@@ -1,4 +1,4 @@
-"""`edge-se bench quality`: how good a made scene gets in a few minutes of training, and the curve on the way."""
+"""`edge-se bench quality`: how good a synthetic scene gets in a few minutes of training, and the curve on the way."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from edge_se_sampler.methods import registered_methods
 def bench_quality(
     output_dir: Path, workplace: Path, method: str, scene: str, seconds: float, seed: int
 ) -> dict[str, Any]:
-    """Train a method on a made scene under its default plan, and leave result.json and curve.png.
+    """Train a method on a synthetic scene under its default plan, and leave result.json and curve.png.
 
     Args:
         output_dir: of the result.

@@ -12,7 +12,7 @@ import torch
 
 from edge_se_sampler.bench.outcomes import judged
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.evaluation import evaluate, shade_behind
+from edge_se_sampler.engine.evaluation import evaluate, get_background_color
 from edge_se_sampler.engine.files import png_bytes
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.session import prepare, test_pictures
@@ -43,7 +43,7 @@ def trial(config: TrainerConfig) -> dict[str, Any]:
     metrics, every = trainer.run.metrics(), trainer.config.steps_per_log
     return {
         **{key: results[key] for key in MEASURES},
-        **judged(results, pictures, shade_behind(model)),
+        **judged(results, pictures, get_background_color(model)),
         "dead_at_start": dead,
         "revived": sum("revived" in line for line in metrics),
         "steps": trainer.next_step,

@@ -17,7 +17,7 @@ class VanillaDataManagerConfig(InstantiateConfig):
 
     train_num_rays_per_batch: int | None = None
     """Rays of a training step; left out, the model's size decides."""
-    live_pixels_only: bool = False
+    skip_empty_rays: bool = False
     """Train only on pixels whose ray meets what the model's economy has kept: the others have no gradient."""
     pixel_sampler: PixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
     """Which pixels are trained on. In Python any host's config may stand here, nerfstudio's own included."""

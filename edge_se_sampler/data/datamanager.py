@@ -96,7 +96,7 @@ class VanillaDataManager:
         image = unit_interval(batch["image"]).to(self.device)
         chunks = list(model.chunks(len(ray_bundle)))
         settings = self.train_pixel_sampler.config
-        if isinstance(settings, SamplingSettings) and settings.se_scoring == "coarse":
+        if isinstance(settings, SamplingSettings) and settings.error_source == "coarse":
             return torch.cat([model.coarse_squared_error(ray_bundle[rows], image[rows]) for rows in chunks])
         return torch.cat([model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in chunks])
 

@@ -51,7 +51,7 @@ def offcenter(
     Args:
         data: a folder as read_blender reads it.
         out: a folder that is not there, or empty.
-        shift: right and down positive; rounded to whole pixels, as the shifted made scenes' offset is.
+        shift: right and down positive; rounded to whole pixels, as the shifted synthetic scenes' offset is.
         pad: added on either side, rounded likewise; None: as much as the shift.
         progress: called as progress(done, total), in views.
 

@@ -73,7 +73,7 @@ class TrainerConfig(InstantiateConfig):
     """Iterations between previews of a validation view; left out, a tenth of the plan."""
     steps_per_log: int = 10
     """Iterations between lines of metrics.jsonl."""
-    revive: bool = False
+    reinit_dead: bool = False
     """Give a dead network (density 0 everywhere, so no gradient) new initial weights, of the next sub-seed."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)

@@ -47,7 +47,7 @@ def pictures_of(views: Views) -> list[Picture]:
     return [Picture(name, unit_float(views.images[i]), generator, i) for i, name in names]
 
 
-def shade_behind(model: RayModel) -> float:
+def get_background_color(model: RayModel) -> float:
     """The background that a model is evaluated on."""
     return 0.0 if model.config.background_color == "black" else 1.0
 
@@ -78,7 +78,7 @@ def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
     rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
     if not np.isfinite(rendered).all():
         raise FloatingPointError("the model's colours are not finite: training diverged; try a lower --optimizer.lr")
-    error = (rendered.astype(np.float64) - target_image(picture, shade_behind(model))) ** 2
+    error = (rendered.astype(np.float64) - target_image(picture, get_background_color(model))) ** 2
     return rendered, psnr(error.mean())
 
 
@@ -149,7 +149,7 @@ def evaluate(
     rows = []
     for i, picture in enumerate(pictures):
         rendered, _ = render_view(model, picture)
-        rows.append({"name": picture.name, **measures(rendered, picture, shade_behind(model))})
+        rows.append({"name": picture.name, **measures(rendered, picture, get_background_color(model))})
         if each is not None:
             each(i, picture, rendered)
     result: dict[str, Any] = {}

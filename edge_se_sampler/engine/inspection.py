@@ -10,9 +10,9 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.engine.show import require_pyplot, save_figure
-from edge_se_sampler.models.config import LeanModelConfig, preset_of, resolved, size_for
+from edge_se_sampler.models.config import LeanModelConfig, apply_preset, preset_of, size_for
 from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.scene_analysis import Needs, live_pixels, needs, spread_pixels
+from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene, live_pixels, spread_pixels
 from edge_se_sampler.sampling.edges import unit_float
 
 RAYS = 4096
@@ -31,7 +31,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
         InputError: matplotlib is missing, or the picture cannot be written.
     """
     pyplot = require_pyplot()
-    told = needs(views, config)
+    told = analyze_scene(views, config)
     live = live_pixels(views, told.hull)
     figure, axes = pyplot.subplots(2, SHOWN, figsize=(9.6, 6.6))
     _draw_hull(axes[0], told)
@@ -41,7 +41,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     return "\n".join(_lines(views, told, live, config))
 
 
-def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelConfig) -> list[str]:
+def _lines(views: Views, told: SceneAnalysis, live: list[np.ndarray], config: LeanModelConfig) -> list[str]:
     """One a finding: the quantity, its value, and where it comes from."""
     hull, box = told.hull, told.box
     sizes = sorted({image.shape[1::-1] for image in views.images})
@@ -54,7 +54,7 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
     across = np.mean(np.concatenate([pixels.ravel() for pixels in live]))
     size = size_for(max(max(size) for size in sizes))
     preset = preset_of(config, size)
-    model = resolved(config, size, preset.rays)
+    model = apply_preset(config, size, preset.rays)
     wave = 2 * np.pi * float(told.grid().reach) / 2 ** ((model.position_frequencies or 1) - 1) / told.footprint
     said = {
         "views": f"{len(views.images)} of {' and '.join(f'{w} x {h}' for w, h in sizes)}, {np.median(distance):.2f} "
@@ -78,16 +78,16 @@ def _lines(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelC
     return [f"{name:<13}{what}" for name, what in said.items()]
 
 
-def _samples(views: Views, told: Needs, live: list[np.ndarray], config: LeanModelConfig) -> tuple[float, float]:
+def _samples(views: Views, told: SceneAnalysis, live: list[np.ndarray], config: LeanModelConfig) -> tuple[float, float]:
     """Samples of a live ray: in the hull, and along the box's whole side; the first a mean over some."""
-    step = config.step_cells * told.hull.side
+    step = config.step_size_voxels * told.hull.side
     chosen = spread_pixels(dict(enumerate(live)), RAYS)
     rays = RayGenerator(cameras_of(views))(chosen)
     samples = OccupancyGrid.of(told.hull).march(rays, step, None, (config.near, config.far))
     return len(samples.t) / len(chosen), 2 * told.box.half / step
 
 
-def _draw_hull(axes: np.ndarray, told: Needs) -> None:
+def _draw_hull(axes: np.ndarray, told: SceneAnalysis) -> None:
     """The hull from three sides: how many cells lie behind each other."""
     hull = told.hull
     ends = hull.corner + np.array(hull.cells.shape) * hull.side

@@ -9,11 +9,11 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.occupancy.scene_analysis import live_pixels, needs
+from edge_se_sampler.occupancy.scene_analysis import analyze_scene, live_pixels
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
 
-SHADES = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
+BACKGROUND_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
 """What a sampler takes to be behind the object; a random background has no edge of its own, and counts as white."""
 
 
@@ -29,18 +29,18 @@ class Pipeline:
     def build(cls, config: TrainerConfig, views: Views, device: str) -> Pipeline:
         """Set up both for a planned config."""
         model_config = config.pipeline.model
-        manager_config, located = config.pipeline.datamanager, False
+        manager_config, has_masks = config.pipeline.datamanager, False
         model = build_model(config, device)
         if model.needs_cells:
-            told = needs(views, model_config)
+            told = analyze_scene(views, model_config)
             model.settle(told.grid())
-            located = told.silhouettes > 0
-            if manager_config.live_pixels_only and located:
+            has_masks = told.silhouettes > 0
+            if manager_config.skip_empty_rays and has_masks:
                 views = views.masked(live_pixels(views, told.hull))
         if isinstance(manager_config.pixel_sampler, SamplingSettings):
-            manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.decided(located))
+            manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         datamanager = manager_config.setup(
-            views=views, device=device, background_color=SHADES[model_config.background_color]
+            views=views, device=device, background_color=BACKGROUND_COLORS[model_config.background_color]
         )
         return cls(datamanager, model)
 

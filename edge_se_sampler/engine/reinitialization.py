@@ -32,7 +32,7 @@ def dead_networks(model: RayModel, probes: Iterable[RayBundle]) -> list[str]:
     return [lvl for lvl in model.levels if not any(render_rays(model, r, f"accumulation_{lvl}").any() for r in parts)]
 
 
-class Revival:
+class DeadNetworkReset:
     """Gives a dead network new initial weights, of the next sub-seed: a function of the seed and of how many have
     been used, as everything random is.
 

@@ -11,9 +11,9 @@ from edge_se_sampler.engine.camera_path import spiral
 from edge_se_sampler.engine.evaluation import (
     Picture,
     evaluate,
+    get_background_color,
     pictures_of,
     render_rays,
-    shade_behind,
     target_image,
 )
 from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
@@ -40,7 +40,7 @@ def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) 
     def each(i: int, picture: Picture, rendered: np.ndarray) -> None:
         progress.update(i + 1)
         if render_output_path is not None:
-            pair = np.concatenate((target_image(picture, shade_behind(model)), rendered), axis=1)
+            pair = np.concatenate((target_image(picture, get_background_color(model)), rendered), axis=1)
             write_image(render_output_path / f"{i:04d}.png", pair)
 
     results = evaluate(model, pictures, each)

@@ -11,14 +11,14 @@ from edge_se_sampler.models.config import (
     InfoNeRFModelConfig,
     LeanModelConfig,
     NeRFModelConfig,
+    apply_preset,
     check_fineness,
     preset_of,
-    resolved,
     size_for,
 )
 
 
-def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
+def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     """The config with nothing left open.
 
     Raises:
@@ -41,7 +41,7 @@ def planned(config: TrainerConfig, views: Views) -> TrainerConfig:
         pipeline=replace(
             config.pipeline,
             datamanager=replace(manager, train_num_rays_per_batch=rays),
-            model=resolved(model, size, rays),
+            model=apply_preset(model, size, rays),
         ),
         optimizer=replace(
             config.optimizer, lr=preset.learning_rate if config.optimizer.lr is None else config.optimizer.lr
@@ -66,9 +66,13 @@ def _check(plan: TrainerConfig) -> None:
     for flag, value in at_least_one.items():
         if value is None or value < 1:
             raise InputError(f"--{flag} is {value}: must be at least 1")
-    if plan.pipeline.datamanager.live_pixels_only and isinstance(model, NeRFModelConfig) and model.economy == "off":
+    if (
+        plan.pipeline.datamanager.skip_empty_rays
+        and isinstance(model, NeRFModelConfig)
+        and not model.empty_space_skipping
+    ):
         raise InputError(
-            "--pipeline.datamanager.live-pixels-only has no effect here; add --pipeline.model.economy auto"
+            "--pipeline.datamanager.skip-empty-rays has no effect here; add --pipeline.model.empty-space-skipping True"
         )
     if model.width is None or model.width < 2:
         raise InputError(
@@ -112,12 +116,14 @@ def _check_nerf(model: NeRFModelConfig) -> None:
 def _check_lean(plan: TrainerConfig, model: LeanModelConfig) -> None:
     if not 0 <= model.features <= 64:
         raise InputError(f"--pipeline.model.features is {model.features}: must be between 0 and 64")
-    if not 0 < model.feature_rate < float("inf"):
-        raise InputError(f"--pipeline.model.feature-rate is {model.feature_rate}: must be above 0")
-    if plan.revive:
-        raise InputError("--revive: this model's density is never 0, it cannot die; leave the flag out")
-    if getattr(plan.pipeline.datamanager.pixel_sampler, "se_scoring", "exact") == "coarse":
-        raise InputError("--pipeline.datamanager.pixel-sampler.se-scoring is coarse: this model has no coarse network")
+    if not 0 < model.feature_lr_scale < float("inf"):
+        raise InputError(f"--pipeline.model.feature-lr-scale is {model.feature_lr_scale}: must be above 0")
+    if plan.reinit_dead:
+        raise InputError("--reinit-dead: this model's density is never 0, it cannot die; leave the flag out")
+    if getattr(plan.pipeline.datamanager.pixel_sampler, "error_source", "fine") == "coarse":
+        raise InputError(
+            "--pipeline.datamanager.pixel-sampler.error-source is coarse: this model has no coarse network"
+        )
 
 
 def _check_info(model: InfoNeRFModelConfig) -> None:

@@ -15,7 +15,7 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
-from edge_se_sampler.engine.resolve import check_seconds, planned
+from edge_se_sampler.engine.resolve import check_seconds, resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer, choose_device
 from edge_se_sampler.errors import InputError
@@ -32,7 +32,7 @@ def prepare(config: TrainerConfig) -> Trainer:
     """
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
-    plan = planned(config, views)
+    plan = resolve_config(config, views)
     keep_freed_memory()
     pipeline = Pipeline.build(plan, views, device)
     return plan.setup(run=RunFolder.create(plan), pipeline=pipeline, preview=preview)
@@ -132,7 +132,7 @@ def summary(trainer: Trainer) -> str:
     ]
     if isinstance(sampler, SamplingSettings):
         until = "until the object is learnt"
-        if sampler.schedule != "auto":
+        if sampler.schedule != "adaptive":
             until = f"for {math.ceil(sampler.early_length(config.max_num_iterations or 0))} iterations"
         early = "" if sampler.early == sampler.late else f"{sampler.early} {until}, then "
         lines.append(f"pixels   {early}{sampler.late}")

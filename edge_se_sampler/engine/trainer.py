@@ -17,7 +17,7 @@ from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.reinitialization import PROBE_RAYS, Revival
+from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.tensorboard import EventWriter
 from edge_se_sampler.errors import InputError
@@ -49,11 +49,11 @@ class Trainer:
         self.callbacks = self.pipeline.datamanager.get_training_callbacks(
             TrainingCallbackAttributes(pipeline=self.pipeline, trainer=self)
         )
-        self.revival: Revival | None = None
-        if config.revive:
+        self.revival: DeadNetworkReset | None = None
+        if config.reinit_dead:
             seed = config.machine.seed
             probe = pipeline.datamanager.probe_rays(PROBE_RAYS, stream(seed, 0, Stream.PROBE))
-            self.revival = Revival(pipeline.model, self.optimizer, probe, seed)
+            self.revival = DeadNetworkReset(pipeline.model, self.optimizer, probe, seed)
         self._preview_psnr: float | None = None
 
     def resume(self, state: dict[str, Any]) -> None:

@@ -31,16 +31,16 @@ class ModelConfig(InstantiateConfig):
     """Depth along the optical axis at which samples begin, world units."""
     far: float = 6.0
     """Depth at which samples end."""
-    economy: Literal["auto", "off"] = "off"
+    empty_space_skipping: bool = False
     """Whether what the scene does not need is left out: auto derives it from cameras and alpha, see inspect."""
-    cell_pixels: float = 1.0
+    voxel_size_px: float = 1.0
     """Side of a cell that is kept or left out, in pixels' footprints at the middle of the scene; larger where there
     would be more cells than are worth their memory."""
 
 
 @dataclass(frozen=True)
 class NeRFModelConfig(ModelConfig):
-    """The original NeRF: two networks, coarse and fine. Under economy auto neither is asked outside of the hull."""
+    """The original NeRF: two networks, coarse and fine. With it neither is asked outside of the hull."""
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.nerf:NeRFModel"
 
@@ -60,23 +60,23 @@ class LeanModelConfig(ModelConfig):
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.lean:LeanModel"
 
-    economy: Literal["auto", "off"] = "auto"
+    empty_space_skipping: bool = True
     """Whether the parts below are at work; off: samples along all of the box."""
     cull_by_alpha: bool = True
     """Leave out what lies outside of the alpha masks' visual hull."""
     cull_by_density: bool = True
     """Leave out where training has seen no density; such cells are tried again now and then."""
-    step_cells: float = 1.0
+    step_size_voxels: float = 1.0
     """Distance between samples, in sides of a cell."""
     features: int = 8
     """Numbers kept at each corner of a cell; 0: the network alone has to know the scene."""
-    feature_rate: float = 6.0
+    feature_lr_scale: float = 6.0
     """Learning rate of the features, in the network's."""
 
     @property
     def learns_cells(self) -> bool:
         """Whether training tells which cells are empty."""
-        return self.economy == "auto" and self.cull_by_density
+        return self.empty_space_skipping and self.cull_by_density
 
 
 @dataclass(frozen=True)
@@ -154,10 +154,10 @@ def check_fineness(config: ModelConfig, prefix: str = "") -> None:
     """
     if not 0 <= config.near < config.far < float("inf"):
         raise InputError(f"--{prefix}near is {config.near}, --{prefix}far {config.far}: 0 <= near < far")
-    if not 0 < config.cell_pixels <= 1000:
-        raise InputError(f"--{prefix}cell-pixels is {config.cell_pixels}: must be above 0, at most 1000")
-    if isinstance(config, LeanModelConfig) and not 0.05 <= config.step_cells < float("inf"):
-        raise InputError(f"--{prefix}step-cells is {config.step_cells}: must be at least 0.05")
+    if not 0 < config.voxel_size_px <= 1000:
+        raise InputError(f"--{prefix}voxel-size-px is {config.voxel_size_px}: must be above 0, at most 1000")
+    if isinstance(config, LeanModelConfig) and not 0.05 <= config.step_size_voxels < float("inf"):
+        raise InputError(f"--{prefix}step-size-voxels is {config.step_size_voxels}: must be at least 0.05")
 
 
 def size_for(pixels_a_side: int) -> str:
@@ -172,7 +172,7 @@ def preset_of(config: ModelConfig, size: str) -> SizePreset[Any]:
     return (LEAN if isinstance(config, LeanModelConfig) else SIZES)[size]
 
 
-def resolved(config: Model, size: str, rays: int) -> Model:
+def apply_preset(config: Model, size: str, rays: int) -> Model:
     """The config with every None replaced by the size's value, or by a step's number of rays."""
     preset = preset_of(config, size).model
     if isinstance(config, InfoNeRFModelConfig) and config.num_unseen_rays is None:

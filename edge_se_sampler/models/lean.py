@@ -18,29 +18,34 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.encoding import encoded_size, positional_encoding
 from edge_se_sampler.models.field import initialize_all, linear
-from edge_se_sampler.models.packed_rendering import render_packed, spread, sum_rays, transmittance
+from edge_se_sampler.models.packed_rendering import (
+    accumulate_along_rays,
+    expand_to_samples,
+    render_packed,
+    transmittance,
+)
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.features import FeatureGrid
-from edge_se_sampler.occupancy.grid import MOST_CELLS, OccupancyGrid, halved, with_neighbours
+from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid, dilate, upsample
 
 RAYS_PER_CHUNK = 4096
-START = -1.0
+DENSITY_BIAS = -1.0
 """Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient. In a box of which
 nothing is known it would be an opaque fog: there, the box has an optical depth of 1 across. (Bricks without alpha, seed
 2: after 15 CPU seconds 13.8 and 27.9 dB.)"""
-WHOLE = 0.9
+UNCARVED_FRACTION = 0.9
 """Share of a box's cells from which on nothing is known of it."""
-LARGEST = 8.0
+MAX_LOG_DENSITY = 8.0
 """Raw density above which a cell is opaque whatever it is."""
-JUDGE_EVERY = 128
+UPDATE_INTERVAL = 128
 """Steps in which cells are seen long enough to be judged; half as many do as long as they are large. What was seen in
 the first does not count: densities mean nothing yet."""
-LEAST_OPACITY = 0.01
+ALPHA_THRESHOLD = 0.01
 """Of the smallest cell that there may be: below, it is taken to be empty."""
-SOLID = 0.5
+MIN_OPTICAL_DEPTH = 0.5
 """Optical depth of a cell that holds something, rather than haze. As long as there is none in a box of which nothing
 was known, nothing is learnt, and nothing judged."""
-TRIED_AGAIN = 0.02
+REACTIVATION_FRACTION = 0.02
 """Share of the empty cells that are tried again until the next judgement; half of it after each split, for there are
 eight times as many, and one of them is enough to find what was missed."""
 MISJUDGED = 0.01
@@ -87,8 +92,8 @@ class LeanField(nn.Module):
         width = h.shape[1]
         encoded = positional_encoding(directions, self.direction_frequencies)
         per_ray = F.linear(encoded, self.view.weight[:, width:], self.view.bias)
-        seen = F.relu(F.linear(h, self.view.weight[:, :width]) + spread(per_ray, first, ray), inplace=True)
-        return self.density(h)[:, 0] + START, torch.sigmoid(self.color(seen))
+        seen = F.relu(F.linear(h, self.view.weight[:, :width]) + expand_to_samples(per_ray, first, ray), inplace=True)
+        return self.density(h)[:, 0] + DENSITY_BIAS, torch.sigmoid(self.color(seen))
 
 
 class LeanModel(RayModel):
@@ -125,9 +130,9 @@ class LeanModel(RayModel):
         """Features at the corners of the grid's cells, and a density to begin with."""
         super().settle(grid)
         inside = grid.possible[1:-1, 1:-1, 1:-1]
-        if inside.float().mean() > WHOLE:
+        if inside.float().mean() > UNCARVED_FRACTION:
             with torch.no_grad():
-                self.fine.density.bias.sub_(math.log(max(inside.shape)) + START)
+                self.fine.density.bias.sub_(math.log(max(inside.shape)) + DENSITY_BIAS)
         if self.config.features:
             self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
 
@@ -135,7 +140,7 @@ class LeanModel(RayModel):
         """The features learn faster: each sees few samples."""
         if self.features is None:
             return super().parameter_groups()
-        return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_rate)]
+        return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_lr_scale)]
 
     def begin_step(self, step: int, seed: int) -> None:
         """As `RayModel`; now and then, cells that have shown no density are left out."""
@@ -144,16 +149,16 @@ class LeanModel(RayModel):
         if grid is None or not self.config.learns_cells:
             return
         large = bool(grid.splits[1])
-        every = JUDGE_EVERY // 2 if large else JUDGE_EVERY
+        every = UPDATE_INTERVAL // 2 if large else UPDATE_INTERVAL
         if step < every or step % every:
             return
-        solid = grid.largest * grid.side > SOLID
+        solid = grid.largest * grid.side > MIN_OPTICAL_DEPTH
         if step == every or (large and not solid.any()):
             grid.largest.zero_()
             return
-        share = TRIED_AGAIN / 2 ** int(grid.splits[0])
+        share = REACTIVATION_FRACTION / 2 ** int(grid.splits[0])
         again = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < share
-        kept = grid.judge(-math.log1p(-LEAST_OPACITY) / float(grid.finest_side), again)
+        kept = grid.judge(-math.log1p(-ALPHA_THRESHOLD) / float(grid.finest_side), again)
         self._refine(grid, kept, solid)
 
     def _refine(self, grid: OccupancyGrid, kept: Tensor, solid: Tensor) -> None:
@@ -165,26 +170,26 @@ class LeanModel(RayModel):
         """
         features = self.features
         done, left = grid.splits.tolist()
-        if left and (done == 0 or 8 * kept.sum() <= MOST_CELLS):
-            grid.split() if features is None else features.own(halved(kept) & grid.possible_after(done + 1))
+        if left and (done == 0 or 8 * kept.sum() <= MAX_OCCUPIED_CELLS):
+            grid.split() if features is None else features.own(upsample(kept) & grid.possible_after(done + 1))
         elif features is not None and done:
             missed = solid & ~features.owned
-            owned = features.owned | (with_neighbours(missed) & grid.possible)
-            if missed.sum() > MISJUDGED * solid.sum() and owned.sum() <= MOST_CELLS:
+            owned = features.owned | (dilate(missed) & grid.possible)
+            if missed.sum() > MISJUDGED * solid.sum() and owned.sum() <= MAX_OCCUPIED_CELLS:
                 features.own(owned)
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`."""
         grid = self.grid
         assert grid is not None, "settle comes first"
-        step = self.config.step_cells * float(grid.side)
+        step = self.config.step_size_voxels * float(grid.side)
         jitter = self.uniform(len(rays), 1) if self.training else None
         samples = grid.march(rays, step, jitter, (self.config.near, self.config.far))
         positions = samples.positions
         features = positions[:, :0] if self.features is None else self.features(positions, samples.cell)
         centered = (positions - grid.middle) / grid.reach
         raw, color = self.fine(centered, features, rays.directions, samples.first, samples.ray)
-        density = torch.exp(raw.clamp(max=LARGEST)) / float(grid.first_side)
+        density = torch.exp(raw.clamp(max=MAX_LOG_DENSITY)) / float(grid.first_side)
         if self.training and self.config.learns_cells:
             grid.remember(samples, density)
         rgb, accumulation = render_packed(density, color, step, samples.first, samples.ray)
@@ -194,6 +199,6 @@ class LeanModel(RayModel):
             tau = density * step
             weight = transmittance(tau, samples.first, samples.ray) * -torch.expm1(-tau)
             far = self.config.far * rays.metadata["directions_norm"]
-            depth = sum_rays((weight * samples.t)[:, None], samples.first)
+            depth = accumulate_along_rays((weight * samples.t)[:, None], samples.first)
             outputs["depth_fine"] = depth + (1 - accumulation) * far
         return outputs | {"background": background}

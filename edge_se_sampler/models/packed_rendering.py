@@ -42,13 +42,13 @@ def transmittance(tau: Tensor, first: Tensor, ray: Tensor) -> Tensor:
     return torch.exp(before[first.clamp(max=len(tau) - 1)][ray] - before).to(tau.dtype)
 
 
-def sum_rays(values: Tensor, first: Tensor) -> Tensor:
+def accumulate_along_rays(values: Tensor, first: Tensor) -> Tensor:
     """Sums over each ray's samples: (m, k) -> (n, k)."""
     order = torch.arange(len(values), device=values.device)
     return torch.nn.functional.embedding_bag(order, values, first, mode="sum")
 
 
-def spread(values: Tensor, first: Tensor, ray: Tensor) -> Tensor:
+def expand_to_samples(values: Tensor, first: Tensor, ray: Tensor) -> Tensor:
     """Each ray's row for each of its samples: (n, k) -> (m, k)."""
     return _Spread.apply(values, first, ray)
 
@@ -64,7 +64,7 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         (first,) = ctx.saved_tensors
-        return sum_rays(gradient, first), None, None
+        return accumulate_along_rays(gradient, first), None, None
 
 
 class _Render(torch.autograd.Function):
@@ -75,7 +75,7 @@ class _Render(torch.autograd.Function):
         before = transmittance(tau, first, ray)
         weight = before * -torch.expm1(-tau)
         ctx.save_for_backward(tau, color, first, ray, before, weight)
-        return sum_rays(torch.cat((color * weight[:, None], weight[:, None]), dim=1), first)
+        return accumulate_along_rays(torch.cat((color * weight[:, None], weight[:, None]), dim=1), first)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -61,7 +61,7 @@ class RayModel(nn.Module, ABC):
     @property
     def needs_cells(self) -> bool:
         """Whether it is to be settled in the scene's cells before it is trained."""
-        return self.config.economy == "auto"
+        return self.config.empty_space_skipping
 
     def settle(self, grid: OccupancyGrid) -> None:
         """Ask networks only in the grid's cells from now on."""

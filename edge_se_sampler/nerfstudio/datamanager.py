@@ -15,7 +15,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
 from edge_se_sampler.nerfstudio.planned import planned_steps, remember_watch
-from edge_se_sampler.nerfstudio.scoring import ray_errors, shade_behind, watch_training
+from edge_se_sampler.nerfstudio.scoring import get_background_color, ray_errors, watch_training
 from edge_se_sampler.sampling.scoring import scoring
 from edge_se_sampler.sampling.settings import SamplingSettings
 
@@ -81,7 +81,7 @@ def attach(trainer: Any, **settings: Any) -> None:
 def _follow(manager: Any, trainer: Any) -> list[TrainingCallback]:
     """Bind a data manager's training sampler to the run; the callbacks tell it the step, and keep what it watches."""
     sampler, config = manager.train_pixel_sampler, trainer.config
-    sampler.background = shade_behind(trainer.pipeline.model)
+    sampler.background = get_background_color(trainer.pipeline.model)
     sampler.bind(
         squared_error=scoring(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
         planned_steps=planned_steps(trainer),

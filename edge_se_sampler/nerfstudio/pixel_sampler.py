@@ -41,9 +41,9 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
                 f"pixel-sampler.importance-weight is {self.importance_weight}: nerfstudio's losses take no weights; "
                 "leave it at 0, or train with edge-se"
             )
-        if self.se_scoring == "coarse":
+        if self.error_source == "coarse":
             raise InputError(
-                f"pixel-sampler.se-scoring is {self.se_scoring!r}: nerfstudio's models render their coarse colours "
+                f"pixel-sampler.error-source is {self.error_source!r}: nerfstudio's models render their coarse colours "
                 "only together with the fine ones; take exact or memory"
             )
         # both come from the cameras: the host's sampler then draws by solid angle, or inside the crop circle alone
@@ -58,7 +58,7 @@ class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """As ImportantPixels.sample; a sampler that follows no training run says so, once, and draws uniformly."""
-        if not self.follows_training and not self._told:
+        if not self.is_bound and not self._told:
             self._told = True
             print(UNBOUND, file=sys.stderr)
         return super().sample(image_batch)

@@ -1,5 +1,5 @@
 """What a nerfstudio run must remember for its phases, kept beside its checkpoint folder: the length that the first
-run was planned for, and under schedule "auto" what its watch saw.
+run was planned for, and under schedule "adaptive" what its watch saw.
 
 nerfstudio 1.1.5 resumes for max_num_iterations *more* steps, in another folder, and its checkpoints are its own. The
 files must not lie among them: nerfstudio reads the name of every file there as that of a step.
@@ -15,7 +15,7 @@ from typing import Any
 
 from edge_se_sampler.engine.files import write_json
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.sampling.schedule import Watch
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 
 FILE = "edge-se-plan.json"
 WATCH_FILE = "edge-se-watch.json"
@@ -48,7 +48,7 @@ def planned_steps(trainer: Any) -> int:
     return steps
 
 
-def remember_watch(trainer: Any, watch: Watch) -> Callable[..., None]:
+def remember_watch(trainer: Any, watch: AdaptiveSchedule) -> Callable[..., None]:
     """Take up the watch of the loaded checkpoint, if there is one; a function of the step, to be called after each
     iteration, that keeps it wherever nerfstudio saves.
 

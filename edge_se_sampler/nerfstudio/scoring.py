@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.edges import WHITE
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
-from edge_se_sampler.sampling.schedule import Watch
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 
 BLACK = (0.0, 0.0, 0.0)
 HOPELESS_AFTER = 1000
@@ -60,13 +60,14 @@ def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Ten
 
 
 def watch_training(model: nn.Module, sampler: ImportantPixels) -> None:
-    """Tell the sampler the errors of every training batch that the model renders (schedule "auto", remembered errors).
+    """Tell the sampler the errors of every training batch that the model renders (for the adaptive schedule and cached
+    errors).
 
     Evaluation is not in training mode, and while candidates are scored the sampler waits for no batch.
     """
 
     def observe(module: nn.Module, _: Any, outputs: dict[str, Tensor]) -> None:
-        batch = sampler.trained_on
+        batch = sampler.pending_batch
         if not module.training or batch is None:
             return
         with torch.no_grad():
@@ -78,7 +79,7 @@ def watch_training(model: nn.Module, sampler: ImportantPixels) -> None:
     model.register_forward_hook(observe)
 
 
-def _warn_of_the_dead(watch: Watch | None) -> None:
+def _warn_of_the_dead(watch: AdaptiveSchedule | None) -> None:
     """Once, in the log: what a sampler cannot help."""
     if watch is not None and watch.observations == HOPELESS_AFTER and watch.remaining > HOPELESS:
         print(
@@ -110,7 +111,7 @@ def _without_trace(model: nn.Module) -> Iterator[None]:
             module._steps_since_update = count
 
 
-def shade_behind(model: Any) -> tuple[float, float, float]:
+def get_background_color(model: Any) -> tuple[float, float, float]:
     """What the model's loss composites RGBA images on; a random background has no edge of its own, and counts as
     white. Without alpha the data parser has composited them already, and this is of no account."""
     background: Any = getattr(getattr(model, "renderer_rgb", None), "background_color", None)

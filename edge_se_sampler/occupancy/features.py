@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from edge_se_sampler.occupancy.grid import OccupancyGrid, resized
+from edge_se_sampler.occupancy.grid import OccupancyGrid, resample
 
 
 class FeatureGrid(nn.Module):
@@ -58,7 +58,7 @@ class FeatureGrid(nn.Module):
         where = torch.cat([grid.corner + torch.nonzero(_corners(cells)) * side for cells, side in shown])
         around = where[:, None] + (torch.tensor(_CORNERS, device=where.device) - 0.5) * (sides[1] / 2)
         cell = grid.locate(around.reshape(-1, 3)).reshape(-1, 8)
-        level = resized(grid.possible_after(0), len(self.owned)).int() + self.owned
+        level = resample(grid.possible_after(0), len(self.owned)).int() + self.owned
         finest = level.reshape(-1)[cell].argmax(dim=1, keepdim=True)  # a corner is its finest cell's
         known = self(where, cell.gather(1, finest)[:, 0])
         if len(owned) > len(grid.occupied):
@@ -93,7 +93,7 @@ class FeatureGrid(nn.Module):
             numbers.append((cells.reshape(-1).cumsum(0, dtype=torch.int32) - 1).clamp(min=0).reshape(cells.shape))
             corners += int(stored.sum())
         self.first = len(lows[0])
-        number = torch.where(self.owned, self.first + numbers[1], resized(numbers[0], len(self.owned)))
+        number = torch.where(self.owned, self.first + numbers[1], resample(numbers[0], len(self.owned)))
         self.register_buffer("number", number.reshape(-1), persistent=False)
         self.register_buffer("rows", torch.cat(rows), persistent=False)
         self.register_buffer("low", torch.cat(lows), persistent=False)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.occupancy.hull import Hull
 
-MOST_CELLS = 2**18
+MAX_OCCUPIED_CELLS = 2**18
 """More cost more than they tell: with four times as many, bricks at 400 pixels ends after 100 CPU seconds at 33.14 dB,
 not 34.41."""
 
@@ -50,7 +50,7 @@ class OccupancyGrid(nn.Module):
         side: h.
         hull: (X, Y, Z) bool: what may hold something, in cells of h, or its half, its quarter, ...; none of the grid's
             outermost cells.
-        splits: how often the grid's cells may be halved along every axis.
+        splits: how often the grid's cells may be upsample along every axis.
         coarser: how often the hull's cells have to be doubled to be the grid's.
     """
 
@@ -69,7 +69,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("corner", corner.float())
         self.register_buffer("side", torch.tensor(side, dtype=torch.float32))
         self.register_buffer("hull", hull.clone())
-        self.register_buffer("occupied", resized(hull, shape[0]))
+        self.register_buffer("occupied", resample(hull, shape[0]))
         self.register_buffer("largest", torch.zeros(shape))
         self.register_buffer("splits", torch.tensor((0, splits)))
 
@@ -99,7 +99,7 @@ class OccupancyGrid(nn.Module):
 
     def possible_after(self, splits: int) -> Tensor:
         """The same when they have been split so often, since the first."""
-        return resized(self.hull, (len(self.occupied) << splits) >> int(self.splits[0]))
+        return resample(self.hull, (len(self.occupied) << splits) >> int(self.splits[0]))
 
     @classmethod
     def at_first(cls, state: Mapping[str, Tensor]) -> tuple[OccupancyGrid, int]:
@@ -116,8 +116,8 @@ class OccupancyGrid(nn.Module):
 
     def split(self) -> None:
         """Halve all cells along every axis."""
-        self.occupied = halved(self.occupied) & self.possible_after(int(self.splits[0]) + 1)
-        self.largest = halved(self.largest)
+        self.occupied = upsample(self.occupied) & self.possible_after(int(self.splits[0]) + 1)
+        self.largest = upsample(self.largest)
         self.side = self.side / 2
         self.splits = self.splits + torch.tensor((1, -1), device=self.splits.device)
 
@@ -197,29 +197,29 @@ class OccupancyGrid(nn.Module):
         Returns:
             (X, Y, Z) bool: the cells that are not occupied for a trial alone.
         """
-        near = with_neighbours(self.largest > empty)
+        near = dilate(self.largest > empty)
         self.occupied.copy_((near | again) & self.possible)
         self.largest.zero_()
         return near & self.possible
 
 
-def with_neighbours(cells: Tensor) -> Tensor:
+def dilate(cells: Tensor) -> Tensor:
     """Cells (X, Y, Z) bool, and the 26 around each; none of them in the outermost."""
     for axis in range(3):
         cells = cells | cells.roll(1, axis) | cells.roll(-1, axis)
     return cells
 
 
-def halved(cells: Tensor) -> Tensor:
+def upsample(cells: Tensor) -> Tensor:
     """(X, Y, Z) -> (2 X, 2 Y, 2 Z): each cell's value for its eight parts."""
     return cells.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
 
 
-def resized(cells: Tensor, length: int) -> Tensor:
+def resample(cells: Tensor, length: int) -> Tensor:
     """(X, Y, Z): the same space in cells of another size, `length` of them along x: parts of each; or, of bool, those
     that have any of them."""
     while len(cells) < length:
-        cells = halved(cells)
+        cells = upsample(cells)
     while len(cells) > length:
         x, y, z = cells.shape
         cells = cells.reshape(x // 2, 2, y // 2, 2, z // 2, 2).any(5).any(3).any(1)

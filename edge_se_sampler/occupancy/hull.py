@@ -23,7 +23,7 @@ from edge_se_sampler.data.blender import Views
 
 MARGIN = 2
 """Pixels that a silhouette may be too small, or moved."""
-WITNESSES = 2
+MIN_EMPTY_VIEWS = 2
 """Views that must see a cell to be empty, where there are as many."""
 FIRST_CELLS = 16
 """Cells along the box when carving begins."""
@@ -31,7 +31,7 @@ FEWER = 0.8
 """Share of cells still in question below which the others are dropped: copying costs, too."""
 ROUNDED = 1e-5
 """Projections are float32, which is a hundredth of a pixel in the largest image."""
-AHEAD, AROUND, BEHIND = 1, 0, -1
+IN_FRONT, STRADDLING, BEHIND = 1, 0, -1
 """Where a cell is, seen from a camera's plane."""
 
 
@@ -151,7 +151,7 @@ def _grid(size: int) -> np.ndarray:
 
 def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side: float) -> np.ndarray:
     """(m,) bool: cells that some view sees and that too few see to be empty."""
-    witnesses = min(WITNESSES, max(1, len(shown)))
+    witnesses = min(MIN_EMPTY_VIEWS, max(1, len(shown)))
     stays = np.zeros(len(centers), dtype=bool)
     left = np.arange(len(centers))  # those that are not known to be empty, and some that are
     empty = np.zeros(len(centers), dtype=np.int32)
@@ -159,9 +159,9 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
     for number, image in enumerate(views.images):
         low, high, where = projected(views, number, centers[left], side)
         height, width = image.shape[:2]
-        ahead = where == AHEAD
+        ahead = where == IN_FRONT
         inside = (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
-        seen |= inside & ahead | (where == AROUND)
+        seen |= inside & ahead | (where == STRADDLING)
         if number in shown:
             silhouette = shown[number]
             whole = (low[0] >= 0) & (low[1] >= 0) & (high[0] <= width) & (high[1] <= height)
@@ -175,14 +175,14 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
 
 
 def projected(views: Views, number: int, centers: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rectangles that cells project into: least and greatest u, v (2, m), and whether each cell is all AHEAD, all
-    BEHIND, or AROUND the camera's plane (m,); only those ahead have a rectangle that means something."""
+    """Rectangles that cells project into: least and greatest u, v (2, m), and whether each cell is all IN_FRONT, all
+    BEHIND, or STRADDLING the camera's plane (m,); only those ahead have a rectangle that means something."""
     pose = views.camera_to_worlds[number]
     axes = pose[:, :3] * (1, -1, -1)
     x, y, z = (axes.T @ (centers - pose[:, 3]).T).astype(np.float32)
     half_x, half_y, half_z = (side / 2 * np.abs(axes).sum(axis=0)).tolist()
-    where = np.where(z > half_z * (1 + ROUNDED), AHEAD, np.where(z < -half_z * (1 + ROUNDED), BEHIND, AROUND))
-    z = np.where(where == AHEAD, z, half_z + 1)
+    where = np.where(z > half_z * (1 + ROUNDED), IN_FRONT, np.where(z < -half_z * (1 + ROUNDED), BEHIND, STRADDLING))
+    z = np.where(where == IN_FRONT, z, half_z + 1)
     reach = 1 / (z * (z - half_z))
     low, high = np.empty((2, 2, len(z)), dtype=np.float32)
     for k, (along, half) in enumerate(((x, half_x), (y, half_y))):

@@ -15,10 +15,10 @@ from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, ModelConfig
-from edge_se_sampler.occupancy.grid import MOST_CELLS, OccupancyGrid
+from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
 from edge_se_sampler.occupancy.hull import (
-    AHEAD,
-    AROUND,
+    IN_FRONT,
+    STRADDLING,
     Box,
     Hull,
     Silhouette,
@@ -29,7 +29,7 @@ from edge_se_sampler.occupancy.hull import (
     silhouettes,
 )
 
-MOST_PLACES = 2**24
+MAX_GRID_CELLS = 2**24
 """Cells of the box around them, which grids have a number for, occupied or not."""
 TOLERATED = 0.01
 """Share of the foreground's pixels that may meet no cell, by stray ones."""
@@ -41,7 +41,7 @@ ROUGH = 64
 
 
 @dataclass(frozen=True)
-class Needs:
+class SceneAnalysis:
     """Of a scene."""
 
     box: Box
@@ -61,7 +61,7 @@ class Needs:
         return OccupancyGrid.of(self.hull, self.splits, self.coarser)
 
 
-def needs(views: Views, config: ModelConfig) -> Needs:
+def analyze_scene(views: Views, config: ModelConfig) -> SceneAnalysis:
     """Derive what training views need under a resolved config.
 
     Where training is to tell which cells are empty, it begins with large ones: of the hull, twice as large; where
@@ -71,14 +71,14 @@ def needs(views: Views, config: ModelConfig) -> Needs:
         InputError: the cameras see nothing of what they look at.
     """
     lean = config if isinstance(config, LeanModelConfig) else None
-    by_alpha = config.economy == "auto" and (lean is None or lean.cull_by_alpha)
+    by_alpha = config.empty_space_skipping and (lean is None or lean.cull_by_alpha)
     learns = lean is not None and lean.learns_cells
-    at_first = MOST_CELLS // 8 if learns else MOST_CELLS
+    at_first = MAX_OCCUPIED_CELLS // 8 if learns else MAX_OCCUPIED_CELLS
     box = box_of(views, config.near, config.far)
     pixel = footprint(views, box)
-    side = config.cell_pixels * pixel
+    side = config.voxel_size_px * pixel
     shown = silhouettes(views) if by_alpha else {}
-    hull = _hull(views, shown, box, side, MOST_CELLS if shown else at_first)
+    hull = _hull(views, shown, box, side, MAX_OCCUPIED_CELLS if shown else at_first)
     if shown and (hull is None or _missed(views, shown, hull) > TOLERATED):
         print(
             "the views' alpha masks do not agree on where the object is, or show too little of it: they carve nothing "
@@ -92,12 +92,12 @@ def needs(views: Views, config: ModelConfig) -> Needs:
             f"({', '.join(f'{x:.2f}' for x in box.middle)}): check the cameras' poses and principal points"
         )
     coarser = COARSER if learns and shown else 0
-    return Needs(box, pixel, len(shown), hull, coarser, coarser or (_splits(hull, side) if learns else 0))
+    return SceneAnalysis(box, pixel, len(shown), hull, coarser, coarser or (_splits(hull, side) if learns else 0))
 
 
 def _splits(hull: Hull, side: float) -> int:
-    """How often cells are to be halved to come to a side; no more often than there are numbers for them."""
-    wanted, possible = np.log2(hull.side / side), np.log2(MOST_PLACES / hull.cells.size) / 3
+    """How often cells are to be upsample to come to a side; no more often than there are numbers for them."""
+    wanted, possible = np.log2(hull.side / side), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3
     return max(0, int(min(np.round(wanted), np.floor(possible))))
 
 
@@ -106,7 +106,7 @@ def _hull(views: Views, shown: dict[int, Silhouette], box: Box, side: float, mos
     rough = carve(views, shown, box, 2 * box.half / ROUGH)
     if rough is None:
         return None
-    volume = max(rough.cells.sum() / most, rough.cells.size / MOST_PLACES) * rough.side**3
+    volume = max(rough.cells.sum() / most, rough.cells.size / MAX_GRID_CELLS) * rough.side**3
     return carve(views, shown, box, max(side, float(np.cbrt(volume))))
 
 
@@ -150,10 +150,10 @@ def _covered(views: Views, number: int, centers: np.ndarray, side: float) -> np.
     is around the camera or as large as the image."""
     height, width = views.images[number].shape[:2]
     low, high, where = projected(views, number, centers, side)
-    shown = (where == AHEAD) & (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
+    shown = (where == IN_FRONT) & (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
     low, high = low[:, shown], high[:, shown]
     reach = int(np.ceil((high - low).max(initial=0) / 2)) + 1
-    if (where == AROUND).any() or reach > max(height, width):
+    if (where == STRADDLING).any() or reach > max(height, width):
         return np.ones((height, width), dtype=bool)
     column, row = np.floor((low + high) / 2).astype(np.int64) + reach
     wide = np.zeros((height + 2 * reach, width + 2 * reach), dtype=np.uint8)

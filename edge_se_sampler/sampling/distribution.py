@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 B = 32
-FULL = 2**30
+CDF_SCALE = 2**30
 """The integer that stands for a node's whole mass: two draws within a node fit into one 64-bit random number."""
 
 
@@ -147,7 +147,7 @@ class PixelTable:
         node = torch.searchsorted(torch.from_numpy(mass), torch.from_numpy(target), right=True).numpy()
         node += base
         node = _child(self._blocks, node, (within >> 34).astype(np.int32))
-        pixel = _child(self._pixels, node, (within >> 4).astype(np.int32) & (FULL - 1))
+        pixel = _child(self._pixels, node, (within >> 4).astype(np.int32) & (CDF_SCALE - 1))
         pixel -= self._first[image] * (B * B)
         width = self._shape[image, 1]
         drawn = np.empty((n, 3), dtype=np.int64)
@@ -172,7 +172,7 @@ class PixelTable:
         for children in (self._pixels, self._blocks):
             node, child = np.divmod(node, B)
             below = np.where(child > 0, children[node, child - 1], 0)
-            p *= (children[node, child] - below) / FULL
+            p *= (children[node, child] - below) / CDF_SCALE
         below = np.where(node > self._first[image], self._mass[node - 1], self._slot[image])
         return torch.from_numpy(p * (self._mass[node] - below))
 
@@ -201,12 +201,12 @@ def _level(child_mass: Tensor) -> tuple[Tensor, Tensor]:
     """Masses of children (n B,) -> their cumulative shares (n, B) int32 and their parents' masses (n,) float64."""
     cumulative = torch.cumsum(child_mass.reshape(-1, B), dim=1, dtype=torch.float64)
     mass = cumulative[:, -1].clone()
-    scale = FULL / mass.clamp(min=torch.finfo(torch.float64).tiny)
+    scale = CDF_SCALE / mass.clamp(min=torch.finfo(torch.float64).tiny)
     return cumulative.mul_(scale[:, None]).round_().int(), mass
 
 
 def _child(cumulative: np.ndarray, node: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The children that targets in [0, FULL) fall into: (nodes, B) shares, (n,) nodes, (n,) -> (n,) numbers of
+    """The children that targets in [0, CDF_SCALE) fall into: (nodes, B) shares, (n,) nodes, (n,) -> (n,) numbers of
     children, counted through all nodes.
 
     A binary search in log2(B) gathers: copying the nodes' rows for torch.searchsorted takes twice the time.

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import torch
 
-MOST_BLOCKS = 2**20
+MAX_BLOCKS = 2**20
 """Of all images together: 8 bytes each, and few enough to be seen again before they fade."""
 FADES = 8.0
 
 
-class ErrorMemory:
+class ErrorMap:
     """Images are added as they are met. Lives on the CPU; its state goes into a checkpoint."""
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class ErrorMemory:
         """How large a block is, and where each image begins."""
         size = np.array(list(self.sizes.values()), dtype=np.int64).reshape(-1, 2)
         self.side = 1
-        while (blocks := -(-size // self.side)).prod(axis=1).sum() > MOST_BLOCKS:
+        while (blocks := -(-size // self.side)).prod(axis=1).sum() > MAX_BLOCKS:
             self.side += 1
         self._columns = blocks[:, 1]
         self._first = np.concatenate(([0], blocks.prod(axis=1).cumsum()))

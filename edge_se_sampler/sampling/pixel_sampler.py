@@ -21,11 +21,11 @@ from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.sampling.background import PlainBackgrounds, summed_up
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.edges import WHITE, edge_strength
-from edge_se_sampler.sampling.error_map import ErrorMemory
+from edge_se_sampler.sampling.error_map import ErrorMap
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.random_streams import Stream, stream
-from edge_se_sampler.sampling.ranking import keep_by_rank
-from edge_se_sampler.sampling.schedule import Watch, phase_at
+from edge_se_sampler.sampling.ranking import sample_by_rank
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule, phase_at
 
 SquaredError = Callable[[dict[str, Any]], Tensor]
 """Candidate batch -> (m,) squared errors of the model's current (fine) colours, without gradients."""
@@ -56,7 +56,7 @@ class ImportantPixels:
 
     def __init__(self, config: Any, **kwargs: Any) -> None:
         # hosts share one config between training and evaluation, and write into it
-        super().__init__(copy.copy(config).decided(), **kwargs)  # pyright: ignore[reportCallIssue]
+        super().__init__(copy.copy(config).resolve_auto(), **kwargs)  # pyright: ignore[reportCallIssue]
         self.config.check()
         # RGB that edges are taken in front of; fixed once a table of edges exists
         self.background: tuple[float, float, float] = kwargs.get("background_color") or WHITE
@@ -65,12 +65,12 @@ class ImportantPixels:
         self._seed = 0
         self._step = 0
         self._rank, self._world = 0, 1
-        self.watch: Watch | None = None
-        """Decides the phase under schedule "auto"."""
-        self.trained_on: dict[str, Any] | None = None
+        self.watch: AdaptiveSchedule | None = None
+        """Decides the phase under schedule "adaptive"."""
+        self.pending_batch: dict[str, Any] | None = None
         """The last batch's pixels, until their errors are observed, if somebody wants to know them."""
-        self.memory: ErrorMemory | None = None
-        """Scores candidates under se_scoring "memory"."""
+        self.memory: ErrorMap | None = None
+        """Scores candidates with error_source "cached"."""
         self._backgrounds = PlainBackgrounds()
         self._tables: dict[str, _Tables] = {}
 
@@ -87,27 +87,26 @@ class ImportantPixels:
                 world-th row of one draw of world x N pixels (of candidates, of which each then keeps its own N).
         """
         self._squared_error = squared_error
-        self.watch = Watch() if self.config.schedule == "auto" else None
-        remembers = self.config.late == "se" and self.config.se_scoring == "memory"
-        self.memory = ErrorMemory() if remembers else None
+        self.watch = AdaptiveSchedule() if self.config.schedule == "adaptive" else None
+        remembers = self.config.late == "se" and self.config.error_source == "cached"
+        self.memory = ErrorMap() if remembers else None
         self._early_steps = self.config.early_length(planned_steps)
         self._seed = seed
         self._rank, self._world = rank, world
 
     def set_step(self, step: int) -> None:
-        """The step about to be trained; draws depend on it alone, and so does the phase but under "auto"."""
+        """The step about to be trained; draws depend on it alone, and so does the phase of a fixed schedule."""
         self._step = step
 
     def observe(self, squared_error: Tensor) -> None:
-        """What training found at the pixels of the last batch: under "auto" the phase follows from it, and what is
-        remembered.
+        """What training found at the pixels of the last batch: the adaptive schedule and cached errors follow from it.
 
         Args:
             squared_error: (n,) of the model's (fine) colours.
         """
-        if self.trained_on is None:
+        if self.pending_batch is None:
             return
-        pixels, self.trained_on = self.trained_on, None
+        pixels, self.pending_batch = self.pending_batch, None
         if self.memory is not None:
             found = squared_error.detach().double().cpu().numpy()
             self.memory.note(pixels["indices"].cpu().numpy(), found, self._step)
@@ -122,14 +121,14 @@ class ImportantPixels:
         self.watch.observe(*summed_up(error, distance, relative, by_edge=self.strategy == "edge", kept=kept))
 
     @property
-    def follows_training(self) -> bool:
+    def is_bound(self) -> bool:
         """Whether it is bound to a run."""
         return self._squared_error is not None
 
     @property
     def strategy(self) -> str:
         """How the current step draws: "uniform", "precrop", "edge" or "se"."""
-        if not self.follows_training:
+        if not self.is_bound:
             return "uniform"
         phase = phase_at(self._step, self._early_steps) if self.watch is None else self.watch.phase
         return self.config.early if phase == "early" else self.config.late
@@ -183,17 +182,17 @@ class ImportantPixels:
         strategy, count = self.strategy, self.num_rays_per_batch
         if self.memory is not None:
             self.memory.add(dict(zip(batch.numbers.tolist(), batch.sizes, strict=True)))
-        if not self.follows_training:
+        if not self.is_bound:
             self._step += 1  # nobody tells an unbound sampler the step: it counts its own calls
         for over in set(self._tables) - {strategy, "uniform"} if self.watch is None else ():
             del self._tables[over]  # the early phase is over for good: give its memory back
-        self.trained_on = None
+        self.pending_batch = None
         if strategy == "se":
             pixels = self._candidates(batch, count)
         else:
             drawn, weight = self._draw(batch, strategy, count)
             pixels = batch.gather(drawn)
-            self._await_errors(batch, drawn, pixels)
+            self._store_pending(batch, drawn, pixels)
             if weight is not None:
                 pixels["weight"] = weight
         if self.config.keep_full_image:
@@ -250,17 +249,22 @@ class ImportantPixels:
             raise InputError(f"strategy {strategy!r}: every pixel that it could draw is masked in all images")
         return source, places, drawable
 
-    def _await_errors(
+    def _store_pending(
         self, batch: ImageBatch, drawn: Tensor, pixels: dict[str, Any], kept: Tensor | None = None
     ) -> None:
         """Keep what `observe` will need of drawn pixels, and of how likely each was kept, if not all were."""
         if self.watch is None and self.memory is None:
             return
-        self.trained_on = {"image": pixels["image"], "indices": pixels["indices"], "drawn": drawn.cpu(), "kept": kept}
+        self.pending_batch = {
+            "image": pixels["image"],
+            "indices": pixels["indices"],
+            "drawn": drawn.cpu(),
+            "kept": kept,
+        }
         if self.watch is not None:
             self._backgrounds.look_at(batch)
             edges, places = self.distribution(batch, "edge")
-            self.trained_on |= {"edges": edges, "places": places}
+            self.pending_batch |= {"edges": edges, "places": places}
 
     def _candidates(self, batch: ImageBatch, count: int) -> dict[str, Any]:
         """Score uniform candidates and keep `count` of them by rank."""
@@ -275,13 +279,13 @@ class ImportantPixels:
                 errors = self._squared_error(candidates)
             if errors.shape != (len(drawn),):
                 raise ValueError(f"{len(drawn)} candidates were scored by errors of shape {tuple(errors.shape)}")
-            self._await_errors(batch, drawn, candidates)
+            self._store_pending(batch, drawn, candidates)
             self.observe(errors)
-        kept = keep_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION, self._rank))
+        kept = sample_by_rank(errors, count, stream(self._seed, self._step, Stream.SELECTION, self._rank))
         pixels = {key: value[kept.rows.to(value.device)] for key, value in candidates.items()}
         relative = kept.inclusion / (count / len(drawn))  # to what it would be without ranks
         if self.memory is not None:
-            self._await_errors(batch, drawn[kept.rows.cpu()], pixels, relative.cpu())
+            self._store_pending(batch, drawn[kept.rows.cpu()], pixels, relative.cpu())
         if self.config.importance_weight:
             pixels["weight"] = relative.to(batch.device) ** -self.config.importance_weight
         return pixels

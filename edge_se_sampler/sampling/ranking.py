@@ -31,7 +31,7 @@ def error_ranks(squared_error: np.ndarray, rng: np.random.Generator) -> np.ndarr
 
 
 @dataclass(frozen=True)
-class Kept:
+class Selection:
     """The candidates that are trained on."""
 
     rows: Tensor
@@ -41,7 +41,7 @@ class Kept:
     makes a mean over the kept unbiased for the mean over the candidates; 1 / p of equation 7 does not."""
 
 
-def keep_by_rank(squared_error: Tensor, keep: int, rng: np.random.Generator) -> Kept:
+def sample_by_rank(squared_error: Tensor, keep: int, rng: np.random.Generator) -> Selection:
     """Keep N of m candidates, without replacement, in proportion to the rank of their squared error.
 
     Args:
@@ -65,4 +65,4 @@ def keep_by_rank(squared_error: Tensor, keep: int, rng: np.random.Generator) -> 
     tau = arrival[order[keep]] if keep < len(errors) else np.inf
     inclusion = -np.expm1(-weights[first] * tau)
     device = squared_error.device
-    return Kept(torch.from_numpy(first).to(device), torch.from_numpy(inclusion).float().to(device))
+    return Selection(torch.from_numpy(first).to(device), torch.from_numpy(inclusion).float().to(device))

@@ -33,7 +33,7 @@ def phase_at(step: int, early_steps: float) -> Phase:
     return "early" if step < early_steps else "late"
 
 
-class Watch:
+class AdaptiveSchedule:
     """Watches the errors of what is trained on: early while that pays, and again when the object is lost.
 
     It knows no number of steps to come, so that it does the same in a short and in a long run.

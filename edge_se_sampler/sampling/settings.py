@@ -24,7 +24,7 @@ class SamplingSettings:
     Or auto (lean-nerf's): by edges as long as they pay, but all alike where alpha tells where the object is."""
     late: Literal["uniform", "se"] = "se"
     """How pixels are drawn afterwards: all alike, or by the rank of their squared error among uniform candidates."""
-    schedule: Literal["fraction", "steps", "auto"] = "fraction"
+    schedule: Literal["fraction", "steps", "adaptive"] = "fraction"
     """What ends the early phase: a share of the planned iterations; a number of steps; or, for edge sampling, that the
     object is learnt and edges no longer pay (it begins again where the object is lost, or they do)."""
     early_fraction: float = 0.1
@@ -45,20 +45,20 @@ class SamplingSettings:
     """Strength that every pixel has besides its edge (epsilon of equation 5), so that none has probability 0."""
     se_candidates: int = 2
     """Candidates scored for each pixel that squared-error sampling keeps."""
-    se_scoring: Literal["exact", "coarse", "memory"] = "exact"
+    error_source: Literal["fine", "coarse", "cached"] = "fine"
     """What scores the candidates: the fine colours (the paper); the coarse network's alone, for a third of the cost;
     or, for next to nothing, what training found there the last times."""
     importance_weight: float = 0.0
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of them."""
 
-    def decided(self: Settings, located: bool = False) -> Settings:
+    def resolve_auto(self: Settings, has_masks: bool = False) -> Settings:
         """With an `early` of auto decided by whether it is known where the object is; `check` comes after."""
         if self.early != "auto":
             return self
-        if located and self.schedule != "auto":
+        if has_masks and self.schedule != "adaptive":
             return replace(self, early="uniform")
-        return replace(self, early="edge", schedule="auto")
+        return replace(self, early="edge", schedule="adaptive")
 
     def check(self) -> None:
         """Raise InputError for a value or a combination that has no meaning."""
@@ -74,8 +74,8 @@ class SamplingSettings:
             refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
         if self.schedule != "steps" and self.early_steps:
             refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
-        if self.schedule == "auto" and self.early != "edge":
-            refuse("schedule", "'auto' asks whether edges pay: it needs early edge")
+        if self.schedule == "adaptive" and self.early != "edge":
+            refuse("schedule", "'adaptive' asks whether edges pay: it needs early edge")
         if not 1e-6 <= self.edge_epsilon <= 1e6:
             refuse("edge_epsilon", "must be between 1e-6 and 1e6 (less would never train flat regions)")
         if self.se_candidates < 2:
@@ -84,11 +84,11 @@ class SamplingSettings:
             refuse("importance_weight", "must be between 0 and 1")
         if self.importance_weight and self.early != "edge" and self.late == "uniform":
             refuse("importance_weight", "has no effect when all that are drawn are drawn alike")
-        if self.se_scoring != "exact" and self.late != "se":
-            refuse("se_scoring", "has no effect without late se")
+        if self.error_source != "fine" and self.late != "se":
+            refuse("error_source", "has no effect without late se")
 
     def early_length(self, planned_steps: int) -> float:
-        """Steps that the early phase lasts in a run planned for that many; under "auto" nobody knows."""
+        """Steps that the early phase lasts in a run planned for that many; under the adaptive schedule nobody knows."""
         # rounded: 0.07 * 100 is 7.000000000000001
         return self.early_steps if self.schedule == "steps" else round(self.early_fraction * planned_steps, 6)
 

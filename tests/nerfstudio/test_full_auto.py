@@ -1,4 +1,4 @@
-"""The whole host under schedule "auto": the phases follow the errors that training sees, and nothing else."""
+"""The whole host under schedule "adaptive": the phases follow the errors that training sees, and nothing else."""
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from edge_se_sampler.sampling.schedule import WINDOW_STEPS  # noqa: E402
 
 def auto(name: str, scene: Path, runs: Path, **changes: Any) -> Any:
     config = config_of(name, scene, runs, **changes)
-    config.pipeline.datamanager.pixel_sampler.schedule = "auto"
+    config.pipeline.datamanager.pixel_sampler.schedule = "adaptive"
     return config
 
 
@@ -44,8 +44,8 @@ def test_every_training_batch_is_observed_once(name: str, alpha: str | None, hos
     rendered: list[float] = []
 
     def record(module: Any, _: Any, outputs: Any) -> None:
-        if module.training and sampler.trained_on is not None:
-            rendered.append(float(squared_errors(module, outputs, sampler.trained_on["image"]).detach().mean()))
+        if module.training and sampler.pending_batch is not None:
+            rendered.append(float(squared_errors(module, outputs, sampler.pending_batch["image"]).detach().mean()))
 
     hooks = trainer.pipeline.model._forward_hooks
     handle = trainer.pipeline.model.register_forward_hook(record)
@@ -69,7 +69,7 @@ def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
     observe, share = sampler.observe, 1.0
 
     def as_if(errors: torch.Tensor) -> None:
-        image, numbers = sampler.trained_on["image"].numpy(), sampler.trained_on["indices"][:, 0].numpy()
+        image, numbers = sampler.pending_batch["image"].numpy(), sampler.pending_batch["indices"][:, 0].numpy()
         distance = sampler._backgrounds.squared_distance(image, numbers, sampler.background)
         observe(torch.full((len(image),), share * float(distance.mean())))  # alike, so that edges do not pay
 
@@ -112,7 +112,7 @@ def test_remembered_errors_are_those_of_training_and_nobody_renders_candidates(
     host_scene: Path, tmp_path: Path
 ) -> None:
     config = config_of("edge-se-nerf", host_scene, tmp_path)
-    config.pipeline.datamanager.pixel_sampler.se_scoring = "memory"
+    config.pipeline.datamanager.pixel_sampler.error_source = "cached"
     trainer = trainer_of(config)
     sampler = trainer.pipeline.datamanager.train_pixel_sampler
     told, seen = observed(trainer), watch(sampler)

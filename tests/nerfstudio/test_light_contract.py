@@ -41,7 +41,7 @@ from edge_se_sampler.data.blender import Views, read_blender  # noqa: E402
 from edge_se_sampler.data.config import VanillaDataManagerConfig  # noqa: E402
 from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig  # noqa: E402
 from edge_se_sampler.engine.pipeline import Pipeline  # noqa: E402
-from edge_se_sampler.engine.resolve import planned  # noqa: E402
+from edge_se_sampler.engine.resolve import resolve_config  # noqa: E402
 from edge_se_sampler.engine.run_folder import RunFolder  # noqa: E402
 from edge_se_sampler.engine.trainer import Trainer  # noqa: E402
 from edge_se_sampler.errors import InputError  # noqa: E402
@@ -315,8 +315,8 @@ def test_loss_weights_are_refused_because_the_host_would_ignore_them() -> None:
 
 
 def test_coarse_scoring_is_refused_because_the_host_renders_both() -> None:
-    with pytest.raises(InputError, match=r"se-scoring is 'coarse'.*only together with the fine ones"):
-        EdgeSEPixelSamplerConfig(se_scoring="coarse").setup(num_rays_per_batch=RAYS)
+    with pytest.raises(InputError, match=r"error-source is 'coarse'.*only together with the fine ones"):
+        EdgeSEPixelSamplerConfig(error_source="coarse").setup(num_rays_per_batch=RAYS)
 
 
 def test_a_setting_without_meaning_is_refused_as_everywhere() -> None:
@@ -345,7 +345,7 @@ def test_their_training_callback_tells_our_sampler_the_step() -> None:
 def trainer_with(pixel_sampler: Any, views: Views, rays: int = RAYS, steps: int = 10) -> Trainer:
     """Our own trainer, a tiny model, and any sampler."""
     manager = VanillaDataManagerConfig(train_num_rays_per_batch=rays, pixel_sampler=pixel_sampler)
-    config = planned(
+    config = resolve_config(
         TrainerConfig(
             pipeline=PipelineConfig(manager, tiny_config(density_activation="softplus")),
             max_num_iterations=steps,

@@ -19,9 +19,9 @@ class BenchChart:
     output_dir: Path
     """Where the result goes; trainings that it already has are kept."""
     workplace: Path = Path("bench")
-    """Where made scenes are kept."""
+    """Where synthetic scenes are kept."""
     data: Path | None = None
-    """Folder with a Blender folder a scene, all of one size of image; left out, seven made scenes of 100 x 100."""
+    """Folder with a Blender folder a scene, all of one size of image; left out, seven synthetic scenes of 100 x 100."""
     variants: tuple[str, ...] = ()
     """Which; none: all. --dry-run tells what they are."""
     scenes: tuple[str, ...] = ("bricks",)
@@ -92,7 +92,7 @@ class BenchBeside:
     label: str = ""
     """What tells these flags from others, in the chart."""
     workplace: Path = Path("bench")
-    """Where made scenes are kept."""
+    """Where synthetic scenes are kept."""
     data: Path | None = None
     """Folder with a Blender folder a scene, all of one size of image; as bench chart has it."""
     scenes: tuple[str, ...] = ("bricks",)

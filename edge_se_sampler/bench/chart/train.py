@@ -22,7 +22,7 @@ from edge_se_sampler.bench.chart.variants import Cell, config_of
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.outcomes import judged
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, evaluate, psnr, render_rays, shade_behind, target_image
+from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_color, psnr, render_rays, target_image
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.models.ray_model import RayModel
@@ -124,7 +124,7 @@ def _trained(trainer: Trainer, ready: float, scale: Scale) -> dict[str, Any]:
             break
     return {
         "psnr": results["psnr"],
-        "outcome": judged(results, pictures, shade_behind(model))["outcome"],
+        "outcome": judged(results, pictures, get_background_color(model))["outcome"],
         "seconds": curve[-1][0],
         "steps": curve[-1][1],
         "evaluations": curve[-1][2],
@@ -134,7 +134,7 @@ def _trained(trainer: Trainer, ready: float, scale: Scale) -> dict[str, Any]:
 
 def glance(model: RayModel, pictures: list[Picture]) -> float:
     """Mean PSNR over the views, each of every third pixel."""
-    shade, rows, told = shade_behind(model), slice(None, None, LOOKED_AT), []
+    shade, rows, told = get_background_color(model), slice(None, None, LOOKED_AT), []
     for picture in pictures:
         rendered = render_rays(model, picture.rays(model.device)[rows]).clamp(0, 1).double()
         truth = torch.from_numpy(target_image(picture, shade)).reshape(-1, 3)[rows]

@@ -20,7 +20,7 @@ GROUPS: dict[Group, str] = {
     "size": "How big, how fine",
 }
 SAMPLER, MODEL, MANAGER = "pipeline.datamanager.pixel_sampler", "pipeline.model", "pipeline.datamanager"
-REMEMBERED = {f"{SAMPLER}.late": "se", f"{SAMPLER}.se_scoring": "memory"}
+REMEMBERED = {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"}
 """Squared errors at next to no cost."""
 
 
@@ -43,9 +43,9 @@ VARIANTS: dict[str, Variant] = {
     "precrop-se": Variant("methods", "Precrop + SE", "precrop-se-nerf"),
     "edge": Variant("methods", "Edge", "edge-nerf"),
     "edge-se": Variant("methods", "Edge + SE", "edge-se-nerf"),
-    "edge-se-coarse": Variant("scorings", "Edge + SE, coarse", "edge-se-nerf", {f"{SAMPLER}.se_scoring": "coarse"}),
-    "edge-se-memory": Variant("scorings", "Edge + SE, memory", "edge-se-nerf", {f"{SAMPLER}.se_scoring": "memory"}),
-    "edge-se-auto": Variant("scorings", "Edge + SE, auto", "edge-se-nerf", {f"{SAMPLER}.schedule": "auto"}),
+    "edge-se-coarse": Variant("scorings", "Edge + SE, coarse", "edge-se-nerf", {f"{SAMPLER}.error_source": "coarse"}),
+    "edge-se-memory": Variant("scorings", "Edge + SE, memory", "edge-se-nerf", {f"{SAMPLER}.error_source": "cached"}),
+    "edge-se-auto": Variant("scorings", "Edge + SE, auto", "edge-se-nerf", {f"{SAMPLER}.schedule": "adaptive"}),
     "lean-se": Variant("sampling", "squared errors remembered", changes=REMEMBERED),
     "lean-se-weighted": Variant(  # Soft Mining's rule (Kheradmand et al. 2024), its exponent; its Langevin moves aside
         "sampling", "squared errors remembered, loss weighted",
@@ -57,17 +57,17 @@ VARIANTS: dict[str, Variant] = {
     ),
     "lean-auto": Variant(
         "sampling", "Edge while it pays, then remembered errors",
-        changes={f"{SAMPLER}.early": "edge", f"{SAMPLER}.schedule": "auto"} | REMEMBERED,
+        changes={f"{SAMPLER}.early": "edge", f"{SAMPLER}.schedule": "adaptive"} | REMEMBERED,
     ),
     "lean-one-image": Variant("sampling", "one image a step", changes={f"{SAMPLER}.images_per_step": "one"}),
-    "all-pixels": Variant("economy", "dead pixels too", changes={f"{MANAGER}.live_pixels_only": False}),
+    "all-pixels": Variant("economy", "dead pixels too", changes={f"{MANAGER}.skip_empty_rays": False}),
     "no-hull": Variant("economy", "no hull", changes={f"{MODEL}.cull_by_alpha": False}),
     "no-hull-uniform": Variant(
         "economy", "no hull, pixels uniform",
         changes={f"{MODEL}.cull_by_alpha": False, f"{SAMPLER}.early": "uniform"},
     ),
     "no-density": Variant("economy", "no density culling", changes={f"{MODEL}.cull_by_density": False}),
-    "economy-off": Variant("economy", "economy off", changes={f"{MODEL}.economy": "off"}),
+    "economy-off": Variant("economy", "economy off", changes={f"{MODEL}.empty_space_skipping": False}),
     "no-features": Variant(
         "economy", "no features: 4 x 96 network",
         changes={f"{MODEL}.features": 0, f"{MODEL}.depth": 4, f"{MODEL}.width": 96},
@@ -75,7 +75,8 @@ VARIANTS: dict[str, Variant] = {
     "two-networks": Variant(
         "economy", "coarse and fine network in the hull", "vanilla-nerf",
         {
-            f"{MODEL}.economy": "auto", f"{MANAGER}.live_pixels_only": True, f"{SAMPLER}.images_per_step": "all",
+            f"{MODEL}.empty_space_skipping": True, f"{MANAGER}.skip_empty_rays": True,
+            f"{SAMPLER}.images_per_step": "all",
         },
     ),
     "width-32": Variant("size", "32 wide", changes={f"{MODEL}.width": 32}),
@@ -86,9 +87,9 @@ VARIANTS: dict[str, Variant] = {
     "frequencies-0": Variant("size", "position as it is", changes={f"{MODEL}.position_frequencies": 0}),
     "frequencies-4": Variant("size", "4 frequencies", changes={f"{MODEL}.position_frequencies": 4}),
     "frequencies-8": Variant("size", "8 frequencies", changes={f"{MODEL}.position_frequencies": 8}),
-    "cells-0.7": Variant("size", "cells of 0.7 pixels", changes={f"{MODEL}.cell_pixels": 0.7}),
-    "cells-1.6": Variant("size", "cells of 1.6 pixels", changes={f"{MODEL}.cell_pixels": 1.6}),
-    "steps-1.5": Variant("size", "steps of 1.5 cells", changes={f"{MODEL}.step_cells": 1.5}),
+    "cells-0.7": Variant("size", "cells of 0.7 pixels", changes={f"{MODEL}.voxel_size_px": 0.7}),
+    "cells-1.6": Variant("size", "cells of 1.6 pixels", changes={f"{MODEL}.voxel_size_px": 1.6}),
+    "steps-1.5": Variant("size", "steps of 1.5 cells", changes={f"{MODEL}.step_size_voxels": 1.5}),
     "rays-128": Variant("size", "128 rays", changes={f"{MANAGER}.train_num_rays_per_batch": 128}),
     "rays-512": Variant("size", "512 rays", changes={f"{MANAGER}.train_num_rays_per_batch": 512}),
 }  # fmt: skip

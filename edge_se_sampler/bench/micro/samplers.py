@@ -19,13 +19,13 @@ from edge_se_sampler.bench.machine import machine, resident_memory
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.resolve import planned
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.random_streams import Stream, stream
-from edge_se_sampler.sampling.ranking import keep_by_rank
+from edge_se_sampler.sampling.ranking import sample_by_rank
 
 EPSILON = np.float32(0.01)
 
@@ -51,7 +51,7 @@ def bench_samplers(images: int, size: int, draws: int, repeats: int) -> dict[str
         "edge_one_image": lambda step: table.draw(one, draws, stream(0, step, Stream.PIXELS)),
         "uniform_all_images": lambda step: uniform.draw(everything, draws, stream(0, step, Stream.PIXELS)),
         "flat_searchsorted": lambda _: torch.searchsorted(flat, torch.rand(draws, dtype=torch.float64) * flat[-1]),
-        "se_selection": lambda step: keep_by_rank(errors, draws, stream(0, step, Stream.SELECTION)),
+        "se_selection": lambda step: sample_by_rank(errors, draws, stream(0, step, Stream.SELECTION)),
         "nerfstudio_uniform": host_uniform,
     }
     times: dict[str, list[float]] = {name: [] for name in cases}
@@ -126,7 +126,7 @@ _PEAK = (
 
 def memory_ratio(rays: int = 1024) -> dict[str, float]:
     """Peak memory of training with SE against training with Random, each in a process of its own."""
-    random, se = (peak_bytes(method, rays, "small", "exact") for method in ("vanilla-nerf", "se-nerf"))
+    random, se = (peak_bytes(method, rays, "small", "fine") for method in ("vanilla-nerf", "se-nerf"))
     return {"rays": rays, "random_bytes": random, "se_bytes": se, "ratio": se / random}
 
 
@@ -144,11 +144,11 @@ def training_peak(method: str, rays: str, size: str, scoring: str) -> int:
     lens = np.full((8, 2), 100.0)
     views = Views(tuple("abcdefgh"), tuple(noise), None, np.tile(pose, (8, 1, 1)), lens, lens / 2)
     config = registered_methods()[method].specification.config
-    how = scoring if method == "se-nerf" else "exact"
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0, se_scoring=how)
+    how = scoring if method == "se-nerf" else "fine"
+    sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0, error_source=how)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=int(rays), pixel_sampler=sampler)
     model = replace(config.pipeline.model, size=size)
-    config = planned(replace(config, pipeline=replace(config.pipeline, datamanager=manager, model=model)), views)
+    config = resolve_config(replace(config, pipeline=replace(config.pipeline, datamanager=manager, model=model)), views)
     before = resident_memory()
     pipeline = Pipeline.build(config, views, "cpu")
     trainer = config.setup(run=RunFolder(Path("never-written")), pipeline=pipeline, preview=None)

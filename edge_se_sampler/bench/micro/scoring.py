@@ -25,7 +25,7 @@ from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import registered_methods
 
-SCORINGS = ("exact", "coarse", "memory")
+SCORINGS = ("fine", "coarse", "cached")
 COMPARED = 4096
 """Pixels whose scores are ranked."""
 
@@ -42,10 +42,10 @@ def bench_scoring(data: Path, size: str, rays: int, rounds: int, learning: int) 
     """
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        trainers = {"random": _trainer("vanilla-nerf", "exact", data, place, size, rays)}
+        trainers = {"random": _trainer("vanilla-nerf", "fine", data, place, size, rays)}
         trainers |= {how: _trainer("se-nerf", how, data, place, size, rays) for how in SCORINGS}
         times = _timed(trainers, rounds)
-        learnt = _trainer("se-nerf", "memory", data, place, size, rays)
+        learnt = _trainer("se-nerf", "cached", data, place, size, rays)
         progress = Progress(learning, "learning")
         for step in range(learning):
             learnt.train_iteration(step)
@@ -70,7 +70,7 @@ def _trainer(method: str, scoring: str, data: Path, place: Path, size: str, rays
     """A dense training whose late phase begins at once."""
     config = registered_methods()[method].specification.config
     manager = config.pipeline.datamanager
-    sampler = replace(manager.pixel_sampler, early_fraction=0.0, se_scoring=scoring)
+    sampler = replace(manager.pixel_sampler, early_fraction=0.0, error_source=scoring)
     manager = replace(manager, train_num_rays_per_batch=rays, pixel_sampler=sampler)
     pipeline = replace(config.pipeline, datamanager=manager, model=replace(config.pipeline.model, size=size))
     return prepare(
@@ -112,7 +112,7 @@ def rankings(trainer: Trainer, step: int) -> dict[str, float]:
                 told.append(model.squared_error(outputs, image[rows], level))
     exact, coarse = (torch.cat(told).numpy() for told in scores.values())
     remembered = memory.recall(indices.numpy(), step, manager.train_pixel_sampler.num_rays_per_batch)
-    return {"coarse": spearman(exact, coarse), "memory": spearman(exact, remembered)}
+    return {"coarse": spearman(exact, coarse), "cached": spearman(exact, remembered)}
 
 
 def spearman(first: np.ndarray, second: np.ndarray) -> float:
@@ -125,7 +125,7 @@ def spearman(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def scene_in(workplace: Path, scene: str) -> Path:
-    """A made scene, made if it is not there."""
+    """A synthetic scene, made if it is not there."""
     data = workplace / "scenes" / scene
     if not data.exists():
         make_scenes(data.parent, [scene])

@@ -12,7 +12,7 @@ import torch
 from edge_se_sampler.bench.paper.trials import LATE_SE, RANDOMS_TIME, TABLES, Cell, Preset, config_of, iterations_of
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.trainer import choose_device
-from edge_se_sampler.models.config import resolved
+from edge_se_sampler.models.config import apply_preset
 
 
 def plan_of(cells: list[Cell], done: int, preset: Preset, workers: int) -> str:
@@ -53,7 +53,7 @@ def _step_seconds(method: str, preset: Preset) -> float:
     table = next(number for number, table in TABLES.items() if table.method == method)
     config = config_of(Cell(table, "chair", "vanilla-nerf", 0), preset, Path(), Path())
     device = choose_device("auto")
-    model_config = resolved(config.pipeline.model, preset.size, preset.rays)
+    model_config = apply_preset(config.pipeline.model, preset.size, preset.rays)
     model = model_config.setup(rng=np.random.default_rng(0)).to(device)
     tried = min(preset.rays, 64)
     rays = RayBundle(

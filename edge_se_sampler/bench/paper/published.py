@@ -6,7 +6,7 @@ Important Pixels Sampling for NeRF Training Based on Edge Values and Squared Err
 from __future__ import annotations
 
 SCENES = ("chair", "drums", "ficus", "hotdog", "bricks", "materials", "mic")
-"""Its columns under the names of the made scenes; bricks stands in for Lego."""
+"""Its columns under the names of the synthetic scenes; bricks stands in for Lego."""
 STRATEGIES = ("vanilla-nerf", "precrop-nerf", "se-nerf", "precrop-se-nerf", "edge-nerf", "edge-se-nerf")
 """Its rows: Random, Precrop + Random, SE, Precrop + SE, Edge, Edge + SE."""
 LABELS = ("Random", "Precrop + Random", "SE", "Precrop + SE", "Edge", "Edge + SE")

@@ -19,7 +19,7 @@ DataOf = Callable[[Any], Path]
 """A cell, of this bench or any that has a table and a scene -> its Blender folder."""
 
 
-def made_scenes(preset: Preset, cells: Sequence[Any], workplace: Path) -> DataOf:
+def synthetic_scenes(preset: Preset, cells: Sequence[Any], workplace: Path) -> DataOf:
     """Make what the cells need and workplace/scenes does not have; where each cell's lies."""
     placements: list[Placement] = sorted({TABLES[cell.table].placement for cell in cells})
     for placement in placements:

@@ -34,7 +34,7 @@ class Table:
     """Settings of the model that differ from the paper's."""
     sampler: dict[str, Any] = field(default_factory=dict)
     """Settings of the sampler that differ."""
-    revive: bool = False
+    reinit_dead: bool = False
     """Dead networks begin anew."""
 
 
@@ -63,7 +63,10 @@ TABLES: dict[int, Table] = PAPERS | {
     15: Table("as 2, softplus density", "nerf", "shifted", ("vanilla-nerf",), model={"density_activation": "softplus"}),
     16: Table("as 2, but in the middle", "nerf", "padded", ("vanilla-nerf", "precrop-nerf", "edge-nerf")),
     17: Table(
-        "as 7, dead networks begin anew", strategies=("vanilla-nerf",), model={"initialization": "torch"}, revive=True
+        "as 7, dead networks begin anew",
+        strategies=("vanilla-nerf",),
+        model={"initialization": "torch"},
+        reinit_dead=True,
     ),
     18: Table(
         "as 8, dead networks begin anew",
@@ -71,7 +74,7 @@ TABLES: dict[int, Table] = PAPERS | {
         "shifted",
         ("vanilla-nerf",),
         model={"initialization": "torch"},
-        revive=True,
+        reinit_dead=True,
     ),
 }
 """The paper's four, and ours."""
@@ -88,7 +91,7 @@ class Preset:
     samples: tuple[int, int] | None = None
     """Coarse and importance samples of a ray; None: the size's."""
     image_size: int | None = None
-    """Of made scenes; None: the data is given."""
+    """Of synthetic scenes; None: the data is given."""
     num_train: int = 50
     num_test: int = 4
 
@@ -164,7 +167,7 @@ def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> Train
         steps_per_save=iterations,
         steps_per_eval_image=iterations,
         steps_per_log=max(1, iterations // 50),
-        revive=table.revive,
+        reinit_dead=table.reinit_dead,
         machine=MachineConfig(seed=cell.seed, device_type="auto"),
         pipeline=replace(config.pipeline, datamanager=manager, model=model),
     )

@@ -1,6 +1,6 @@
-"""What schedule "auto" is put to: does any seed fail under it, and is it as good as a well chosen fixed length.
+"""What schedule "adaptive" is put to: does any seed fail under it, and is it as good as a well chosen fixed length.
 
-arm   Random; Edge + SE with dead networks begun anew under "auto"; or under a fixed share of the iterations
+arm   Random; Edge + SE with dead networks reinitialised, under the adaptive schedule or a fixed share of the iterations
 """
 
 from __future__ import annotations
@@ -82,9 +82,9 @@ def settings_of(cell: Cell, data: Path, output_dir: Path) -> TrainerConfig:
     if cell.arm == "random":
         return config
     manager = config.pipeline.datamanager
-    changes: dict[str, Any] = {"schedule": "auto"} if cell.arm == "auto" else {"early_fraction": float(cell.arm)}
+    changes: dict[str, Any] = {"schedule": "adaptive"} if cell.arm == "auto" else {"early_fraction": float(cell.arm)}
     manager = replace(manager, pixel_sampler=replace(manager.pixel_sampler, **changes))
-    return replace(config, pipeline=replace(config.pipeline, datamanager=manager), revive=True)
+    return replace(config, pipeline=replace(config.pipeline, datamanager=manager), reinit_dead=True)
 
 
 def run_cell(cell: Cell, data: Path, output_dir: Path) -> dict[str, Any]:

@@ -19,18 +19,18 @@ class Strategy:
     early: str
     late: str
     schedule: str = "fraction"
-    revive: bool = False
+    reinit_dead: bool = False
 
 
 STRATEGIES = {
     "vanilla-nerf": Strategy("Random", "uniform", "uniform"),
-    "revived": Strategy("Random, dead networks anew", "uniform", "uniform", revive=True),
+    "revived": Strategy("Random, dead networks anew", "uniform", "uniform", reinit_dead=True),
     "precrop-nerf": Strategy("Precrop + Random", "precrop", "uniform"),
     "se-nerf": Strategy("SE", "uniform", "se"),
     "precrop-se-nerf": Strategy("Precrop + SE", "precrop", "se"),
     "edge-nerf": Strategy("Edge", "edge", "uniform"),
     "edge-se-nerf": Strategy("Edge + SE", "edge", "se"),
-    "auto": Strategy("Edge + SE, auto, dead anew", "edge", "se", schedule="auto", revive=True),
+    "auto": Strategy("Edge + SE, auto, dead anew", "edge", "se", schedule="adaptive", reinit_dead=True),
 }
 """The paper's six, and those that repair."""
 

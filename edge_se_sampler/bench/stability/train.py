@@ -25,7 +25,7 @@ from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render
 from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
-from edge_se_sampler.engine.resolve import planned
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import keep_freed_memory
 from edge_se_sampler.engine.trainer import Trainer
@@ -99,10 +99,10 @@ def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Pat
         machine=MachineConfig(seed=seed, device_type="cpu"),
         optimizer=replace(config.optimizer, lr=LEARNING_RATE * point.rate),
         pipeline=replace(config.pipeline, datamanager=manager, model=model),
-        revive=chosen.revive,
+        reinit_dead=chosen.reinit_dead,
     )
     train = train.subset(range(point.views))
-    config = planned(config, train)
+    config = resolve_config(config, train)
     in_front_of = COLORS.get(point.background, COLORS["white"])
     datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=in_front_of)
     pipeline = Pipeline(datamanager, build_model(config, "cpu"))

@@ -1,4 +1,4 @@
-"""Made scenes: seven small analytic stand-ins for NeRF's Blender scenes, rendered with numpy alone."""
+"""Synthetic scenes: seven small analytic stand-ins for NeRF's Blender scenes, rendered with numpy alone."""
 
 from __future__ import annotations
 

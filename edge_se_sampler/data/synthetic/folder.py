@@ -1,4 +1,4 @@
-"""Made scenes as folders in the layout of NeRF's Blender scenes, each written whole or not at all."""
+"""Synthetic scenes as folders in the layout of NeRF's Blender scenes, each written whole or not at all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_se_sampler.data.new_folder import appearing, check_free
 from edge_se_sampler.data.synthetic.cameras import Camera, Framing, Placement, Split, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES, check_name, made_scene
+from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES, check_name, synthetic_scene
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
 
@@ -197,7 +197,7 @@ def _pictures(views: Sequence[_View]) -> list[bytes]:
 
 def _picture(view: _View) -> bytes:
     """The PNG file of one view."""
-    scene = made_scene(view.scene)
+    scene = synthetic_scene(view.scene)
     if view.may_clip:
         picture = _uncropped(render(scene, _one_pixel_wider(view.camera)), view)
     else:

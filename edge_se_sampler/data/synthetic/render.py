@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge_se_sampler.data.synthetic.cameras import Camera
-from edge_se_sampler.data.synthetic.catalogue import made_scene
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.linear import Array, apply, unit, vector
 from edge_se_sampler.data.synthetic.scene import Scene
 from edge_se_sampler.data.synthetic.shading import radiance
@@ -34,7 +34,7 @@ _SRGB_STEPS = _srgb_steps()
 def render_view(
     name: str, camera_to_world: ArrayLike, focal: float, principal: tuple[float, float], width: int, height: int
 ) -> NDArray[np.uint8]:
-    """One view of a made scene.
+    """One view of a synthetic scene.
 
     `camera_to_world` is (4, 4) or (3, 4) in NeRF's convention (x right, y up, looking along -z; a rotation and an eye
     in world units), `focal` and `principal` (x, y) are in pixels, pixel (0, 0) having its centre at (0.5, 0.5).
@@ -42,7 +42,7 @@ def render_view(
 
     Raises InputError for a name that is not in SCENE_NAMES.
     """
-    return render(made_scene(name), Camera(vector(camera_to_world), focal, principal, width, height))
+    return render(synthetic_scene(name), Camera(vector(camera_to_world), focal, principal, width, height))
 
 
 def render(scene: Scene, camera: Camera) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""The seven made scenes, one file each, and the scene of NeRF's Blender set that each stands in for."""
+"""The seven synthetic scenes, one file each, and the scene of NeRF's Blender set that each stands in for."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ANALOG_OF = {name: "lego" if name == "bricks" else name for name in SCENE_NAMES}
 
 
 @cache
-def made_scene(name: str) -> Scene:
+def synthetic_scene(name: str) -> Scene:
     """The scene called `name`, built once. Raises InputError if there is none; the message names the nearest."""
     check_name(name)
     builder = SceneBuilder()
@@ -39,9 +39,11 @@ def made_scene(name: str) -> Scene:
 
 
 def check_name(name: str) -> None:
-    """Raises InputError if no made scene is called `name`."""
+    """Raises InputError if no synthetic scene is called `name`."""
     if name in _BUILDERS:
         return
     known = {ANALOG_OF[made]: made for made in SCENE_NAMES} | {made: made for made in SCENE_NAMES}
     nearest = known[get_close_matches(name, known, n=1, cutoff=0)[0]]
-    raise InputError(f"no made scene is called {name!r}: did you mean {nearest!r}? There are {', '.join(SCENE_NAMES)}")
+    raise InputError(
+        f"no synthetic scene is called {name!r}: did you mean {nearest!r}? There are {', '.join(SCENE_NAMES)}"
+    )
