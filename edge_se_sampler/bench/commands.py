@@ -189,8 +189,8 @@ class BenchPaper(_Parallel):
         from edge_se_sampler.bench.paper.scenes import check_real, real_scenes, synthetic_scenes
         from edge_se_sampler.bench.paper.trials import PRESETS, TABLES, cells, run_cell
         from edge_se_sampler.bench.runner import begun, executor_of, missing, run_cells
+        from edge_se_sampler.engine.figures import require_pyplot
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.engine.show import require_pyplot
 
         check_known("tables", self.tables, TABLES)
         check_known("scenes", self.scenes, SCENES)
@@ -252,8 +252,8 @@ class BenchStability(_Parallel):
         from edge_se_sampler.bench.stability.settings import STRATEGIES, cells, points
         from edge_se_sampler.bench.stability.summary import write_outputs
         from edge_se_sampler.bench.stability.train import Scale, run_cell
+        from edge_se_sampler.engine.figures import require_pyplot
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.engine.show import require_pyplot
 
         check_known("points", self.points, range(len(points())))
         check_known("strategies", self.strategies, STRATEGIES)
@@ -309,8 +309,8 @@ class BenchSchedule(_Parallel):
             length_cells,
             run_cell,
         )
+        from edge_se_sampler.engine.figures import require_pyplot
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.engine.show import require_pyplot
 
         if not (self.parts and self.failure_seeds and self.length_seeds):
             raise InputError("--parts, --failure-seeds and --length-seeds: give at least one of each")

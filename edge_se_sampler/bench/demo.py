@@ -14,11 +14,11 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.evaluation import Picture, evaluate, pictures_of, psnr, target_image
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
-from edge_se_sampler.engine.show import require_pyplot, save_figure
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import registered_methods
 

@@ -10,11 +10,11 @@ from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.bench.micro.scoring import scene_in
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.evaluation import evaluate
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.resolve import check_seconds
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
-from edge_se_sampler.engine.show import require_pyplot, save_figure
 from edge_se_sampler.methods import registered_methods
 
 

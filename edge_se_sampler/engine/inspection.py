@@ -9,7 +9,7 @@ import numpy as np
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.datamanager import cameras_of
-from edge_se_sampler.engine.show import require_pyplot, save_figure
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.models.config import LeanModelConfig, apply_preset, preset_of, size_for
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene, live_pixels, spread_pixels

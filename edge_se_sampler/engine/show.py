@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import image_batch
-from edge_se_sampler.engine.files import write_atomically
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.distribution import PixelTable
 from edge_se_sampler.sampling.edges import luma, unit_float
@@ -82,31 +81,3 @@ def _show_view(axes, views: Views, k: int, p: np.ndarray, strategy: str, count: 
     axes[2].set_title(caption, fontsize=9)
     for axis in axes:
         axis.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-
-
-def require_pyplot():
-    """matplotlib's pyplot, drawing to files.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import matplotlib
-    except ImportError:
-        raise InputError("pictures need the [plots] extra: pip install 'edge-se-sampler[plots]'") from None
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
-def save_figure(figure, path: Path) -> None:
-    """Write a figure as PNG and close it.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    require_pyplot().close(figure)
-    write_atomically(path, buffer.getvalue())

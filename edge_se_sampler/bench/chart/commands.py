@@ -47,8 +47,8 @@ class BenchChart:
         from edge_se_sampler.bench.chart.train import Scale, run_cell
         from edge_se_sampler.bench.chart.variants import VARIANTS, cells
         from edge_se_sampler.bench.runner import alone, begun, default_workers, missing, run_cells
+        from edge_se_sampler.engine.figures import require_pyplot
         from edge_se_sampler.engine.files import make_folder
-        from edge_se_sampler.engine.show import require_pyplot
 
         check_known("variants", self.variants, VARIANTS)
         _check_chosen(self.seeds, self.scenes, self.seconds, self.threads)

@@ -20,7 +20,7 @@ from edge_se_sampler.bench.chart.summary import (
 )
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
 from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS, Group
-from edge_se_sampler.engine.show import require_pyplot
+from edge_se_sampler.engine.figures import require_pyplot
 
 MIB = 2**20
 

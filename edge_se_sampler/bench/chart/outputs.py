@@ -11,8 +11,8 @@ from edge_se_sampler.bench.chart.report import report
 from edge_se_sampler.bench.chart.summary import front, table
 from edge_se_sampler.bench.chart.train import Scale
 from edge_se_sampler.bench.runner import write_result
+from edge_se_sampler.engine.figures import save_figure
 from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.engine.show import save_figure
 
 
 def write_outputs(result: dict[str, Any], external: Sequence[dict[str, Any]], output_dir: Path) -> None:

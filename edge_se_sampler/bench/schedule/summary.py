@@ -14,8 +14,8 @@ from edge_se_sampler.bench.paper.trials import TABLES
 from edge_se_sampler.bench.runner import write_result
 from edge_se_sampler.bench.schedule.trials import CONFIGURATIONS, FRACTIONS, LENGTHS, OF_LENGTHS, choice_seeds
 from edge_se_sampler.bench.statistics import paired_difference, wilson
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.engine.show import require_pyplot, save_figure
 
 MARGIN = 0.2
 """dB: not worse by more."""

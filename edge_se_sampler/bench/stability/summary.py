@@ -12,8 +12,8 @@ import numpy as np
 from edge_se_sampler.bench.runner import write_result
 from edge_se_sampler.bench.stability.settings import STRATEGIES, points
 from edge_se_sampler.bench.statistics import wilson
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.engine.show import require_pyplot, save_figure
 
 SHORT = {
     "slow": "slow",

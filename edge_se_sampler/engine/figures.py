@@ -1,0 +1,37 @@
+"""Matplotlib figures, written as PNG files."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+from edge_se_sampler.engine.files import write_atomically
+from edge_se_sampler.errors import InputError
+
+
+def require_pyplot():
+    """Import matplotlib's pyplot with the backend that draws to files.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        raise InputError("pictures need the [plots] extra: pip install 'edge-se-sampler[plots]'") from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def save_figure(figure, path: Path) -> None:
+    """Write a figure as PNG and close it.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    require_pyplot().close(figure)
+    write_atomically(path, buffer.getvalue())
