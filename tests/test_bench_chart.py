@@ -27,7 +27,7 @@ from edge_se_sampler.bench.chart.summary import (
 )
 from edge_se_sampler.bench.chart.train import Scale, iterations_within, run_cell
 from edge_se_sampler.bench.chart.variants import VARIANTS, Cell, cells, changed, config_of
-from edge_se_sampler.bench.runner import alone
+from edge_se_sampler.bench.experiment import alone
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.resolve import resolve_config

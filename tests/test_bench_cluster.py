@@ -14,7 +14,7 @@ pytest.importorskip("distributed", reason="needs the [cluster] extra")
 
 from distributed import LocalCluster
 
-from edge_se_sampler.bench import runner as running
+from edge_se_sampler.bench import experiment as running
 from edge_se_sampler.bench.paper.trials import PRESETS, Cell
 from edge_se_sampler.errors import InputError
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench import runner as running
+from edge_se_sampler.bench import experiment as running
 from edge_se_sampler.bench.chart.train import Scale
 from edge_se_sampler.bench.chart.variants import Cell, cells
 
@@ -33,7 +33,7 @@ INTERRUPTED = """
 import os, pathlib, signal, sys, time
 from edge_se_sampler.bench.chart.train import Scale
 from edge_se_sampler.bench.chart.variants import Cell
-from edge_se_sampler.bench.runner import begun, executor_of, run_cells
+from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
 
 def interrupts_and_works_on(cell, *_):
     os.kill(os.getppid(), signal.SIGINT)
@@ -73,7 +73,7 @@ def test_an_executor_that_only_waits_is_left_in_good_order(tmp_path: Path) -> No
 
 GIVES_OUT_WORK = """
 import os, time
-from edge_se_sampler.bench.runner import executor_of
+from edge_se_sampler.bench.experiment import executor_of
 if __name__ == "__main__":
     executor = executor_of(1, None)()
     print(executor.submit(os.getpid).result(), flush=True)
@@ -119,7 +119,7 @@ def test_a_killed_training_is_told_and_costs_no_other(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="looks for processes in /proc")
 def test_a_process_of_its_own_ends_with_the_one_that_asked_for_it() -> None:
-    program = "import time; from edge_se_sampler.bench.runner import alone; alone(time.sleep, 60)"
+    program = "import time; from edge_se_sampler.bench.experiment import alone; alone(time.sleep, 60)"
     with subprocess.Popen([sys.executable, "-c", program]) as parent:
         children: list[Path] = []
         until = time.monotonic() + 60

@@ -15,8 +15,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench import runner as running
-from edge_se_sampler.bench.outcomes import background_measures, foreground_share, outcome
+from edge_se_sampler.bench import experiment as running
+from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.bench.paper import estimate
 from edge_se_sampler.bench.paper.outputs import keep_view
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES, published

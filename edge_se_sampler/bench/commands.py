@@ -151,7 +151,7 @@ class _Parallel:
 
     def processes(self) -> int:
         """--workers, checked."""
-        from edge_se_sampler.bench.runner import default_workers
+        from edge_se_sampler.bench.experiment import default_workers
 
         if self.workers is not None and self.workers < 1:
             raise InputError(f"--workers is {self.workers}: give at least one")
@@ -183,12 +183,12 @@ class BenchPaper(_Parallel):
     """Only tell which cells there are and how long they will take; trains nothing, writes nothing."""
 
     def run(self) -> None:
+        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
         from edge_se_sampler.bench.paper.estimate import plan_of
         from edge_se_sampler.bench.paper.outputs import keep_view, write_outputs
         from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
         from edge_se_sampler.bench.paper.scenes import check_real, real_scenes, synthetic_scenes
         from edge_se_sampler.bench.paper.trials import PRESETS, TABLES, cells, run_cell
-        from edge_se_sampler.bench.runner import begun, executor_of, missing, run_cells
         from edge_se_sampler.engine.figures import require_pyplot
         from edge_se_sampler.engine.files import make_folder
 
@@ -248,7 +248,7 @@ class BenchStability(_Parallel):
     """Only tell which points there are, and how much is done; trains nothing, writes nothing."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.runner import begun, executor_of, missing, run_cells
+        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
         from edge_se_sampler.bench.stability.settings import STRATEGIES, cells, points
         from edge_se_sampler.bench.stability.summary import write_outputs
         from edge_se_sampler.bench.stability.train import Scale, run_cell
@@ -295,9 +295,9 @@ class BenchSchedule(_Parallel):
     """Of the runs over planned lengths; the fixed length is chosen on others."""
 
     def run(self) -> None:
+        from edge_se_sampler.bench.experiment import begun, executor_of, run_cells
         from edge_se_sampler.bench.paper.scenes import synthetic_scenes
         from edge_se_sampler.bench.paper.trials import PRESETS
-        from edge_se_sampler.bench.runner import begun, executor_of, run_cells
         from edge_se_sampler.bench.schedule.summary import best_shares, write_outputs
         from edge_se_sampler.bench.schedule.trials import (
             LENGTHS,

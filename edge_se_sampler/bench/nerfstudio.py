@@ -25,7 +25,7 @@ from typing import Any
 import torch
 
 from edge_se_sampler.bench.machine import machine, resident_memory
-from edge_se_sampler.bench.outcomes import background_measures, foreground_share, outcome
+from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.evaluation import measures, pictures_of

@@ -1,7 +1,7 @@
 """Whether a training got anywhere: the one rule behind every claim about stability here.
 
-Opacity tells nothing: with the last interval endless, a ray through white fog is as opaque as one that hits. So the
-rule compares with the image of the background alone.
+Opacity tells nothing: with the last interval endless, a ray through white fog is as opaque as one that hits the object.
+So the rule compares with a rendering of the background alone.
 """
 
 from __future__ import annotations
@@ -13,12 +13,29 @@ import numpy as np
 from edge_se_sampler.engine.evaluation import Picture, measures
 from edge_se_sampler.errors import InputError
 
-Outcome = Literal["learnt", "slow", "background"]
+Outcome = Literal["converged", "underfit", "collapsed"]
+COLLAPSED_SHARE = 0.9
+"""Share of the background's error on the object above which nothing of the object was learnt."""
+MIN_GAIN = 0.5
+"""dB above the background alone, below which a training is underfit."""
 
 
-def background_measures(pictures: list[Picture], shade: float) -> list[dict[str, float | None]]:
-    """`measures` of answering every view with the background alone."""
-    return [measures(np.full((*p.image.shape[:2], 3), shade), p, shade) for p in pictures]
+def classify(psnr: float, background_psnr: float, foreground_share: float) -> Outcome:
+    """How a training ended: "collapsed", nothing of the object was learnt; "underfit", less than 0.5 dB better than
+    the background alone; else "converged". The first two are failures."""
+    if foreground_share > COLLAPSED_SHARE:
+        return "collapsed"
+    return "underfit" if psnr < background_psnr + MIN_GAIN else "converged"
+
+
+def failed(run: dict[str, Any]) -> bool:
+    """Whether a run's outcome is a failure."""
+    return run["outcome"] != "converged"
+
+
+def measure_background(pictures: list[Picture], color: float) -> list[dict[str, float | None]]:
+    """`measures` of answering every view with a plain grey background (0 black, 1 white)."""
+    return [measures(np.full((*p.image.shape[:2], 3), color), p, color) for p in pictures]
 
 
 def foreground_share(results: dict[str, Any], background: list[dict[str, float | None]]) -> float:
@@ -26,36 +43,25 @@ def foreground_share(results: dict[str, Any], background: list[dict[str, float |
 
     Args:
         results: of `evaluate`.
-        background: of `background_measures` on the same views.
+        background: of `measure_background` on the same views.
 
     Raises:
         InputError: no view tells the object from the background.
     """
     pairs = [
-        (own["foreground_psnr"], alone["foreground_psnr"])
-        for own, alone in zip(results["images"], background, strict=True)
+        (rendered["foreground_psnr"], empty["foreground_psnr"])
+        for rendered, empty in zip(results["images"], background, strict=True)
     ]
-    shares = [10 ** ((alone - own) / 10) for own, alone in pairs if own is not None and alone is not None]
+    shares = [10 ** ((empty - rendered) / 10) for rendered, empty in pairs if None not in (rendered, empty)]
     if not shares:
-        raise InputError("the held-out views show no object by alpha, which the rule of failure asks for")
+        raise InputError("the held-out views show no object by alpha, which the rule of failure needs")
     return float(np.mean(shares))
 
 
-def judged(results: dict[str, Any], pictures: list[Picture], shade: float) -> dict[str, Any]:
-    """Of a training by its `evaluate` on pictures: background_psnr, foreground_share and outcome."""
-    background = background_measures(pictures, shade)
-    background_psnr = sum(alone["psnr"] or 0.0 for alone in background) / len(background)
+def measure_outcome(results: dict[str, Any], pictures: list[Picture], color: float) -> dict[str, Any]:
+    """background_psnr, foreground_share and outcome of a training by its `evaluate` on pictures."""
+    background = measure_background(pictures, color)
+    background_psnr = sum(view["psnr"] or 0.0 for view in background) / len(background)
     share = foreground_share(results, background)
-    return {
-        "background_psnr": background_psnr,
-        "foreground_share": share,
-        "outcome": outcome(results["psnr"], background_psnr, share),
-    }
-
-
-def outcome(psnr: float, background_psnr: float, share: float) -> Outcome:
-    """ "background": nothing of the object was learnt; "slow": less than 0.5 dB better than the background alone, or
-    worse than it; "learnt" otherwise. The first two are failures."""
-    if share > 0.9:
-        return "background"
-    return "slow" if psnr < background_psnr + 0.5 else "learnt"
+    outcome = classify(results["psnr"], background_psnr, share)
+    return {"background_psnr": background_psnr, "foreground_share": share, "outcome": outcome}

@@ -1,6 +1,7 @@
-"""Many trainings in parallel processes: every finished one is kept, and a later call goes on where one was ended.
+"""Many trainings in parallel processes, kept in one result.json: every finished one stays, a later call goes on.
 
-cell   where a training stands, a frozen dataclass with a name; its fields, and what was measured, make a run
+trial   what identifies a training: a frozen dataclass of plain values, with a `name`
+run     a trial's fields and what was measured
 """
 
 from __future__ import annotations
@@ -8,168 +9,110 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shlex
 import signal
+import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from dataclasses import asdict
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.engine.files import write_atomically
+from edge_se_sampler.engine.files import make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 
-VERSION = 1
-BROKEN_POOLS = 3
-"""A pool of processes breaks when one is killed; so many new ones are started before giving up."""
+VERSION = 2
+MAX_BROKEN_POOLS = 3
+"""A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
-Train = Callable[..., dict[str, Any]]
-"""Cell, further arguments -> its run; called in another process."""
-
-
-def executor_of(workers: int, scheduler: str | None) -> Callable[[], Executor]:
-    """What makes the executor: processes of this machine, or those behind a dask scheduler.
-
-    Raises:
-        InputError: the [cluster] extra is missing, or nobody answers at the scheduler's address.
-    """
-    if scheduler is None:
-        spawn = multiprocessing.get_context("spawn")  # a forked torch may hang
-        return lambda: ProcessPoolExecutor(workers, spawn, _begin_worker)
-    try:
-        from distributed import Client  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise InputError("--scheduler needs the [cluster] extra: pip install 'edge-se-sampler[cluster]'") from None
-    try:
-        client = Client(scheduler, timeout="10s")
-    except (OSError, ValueError) as problem:
-        raise InputError(f"--scheduler {scheduler}: no dask scheduler answers there ({problem})") from problem
-    return client.get_executor
+Run = dict[str, Any]
 
 
-def alone(train: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-    """What a function returns in a process of its own, which nothing else has grown.
+@dataclass(frozen=True)
+class Experiment:
+    """What is trained, and how large."""
 
-    Raises:
-        RuntimeError: that process was killed.
-    """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _end_with_parent) as executor:
-        try:
-            return executor.submit(train, *arguments).result()
-        except BrokenExecutor:
-            raise RuntimeError("its process was killed; is there too little memory?") from None
-
-
-def _begin_worker() -> None:
-    """Ctrl-C reaches every process of a terminal: the one that gives out the work answers it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_parent()
+    name: str
+    """As in `edge-se bench NAME`; the report is chosen by it."""
+    settings: Any
+    """A dataclass of plain values; a result.json of other settings is refused."""
+    trials: Callable[[list[Run]], Sequence[Any]]
+    """Runs so far -> the trials to train. Called again until none is pending, so that later trials may depend on
+    earlier results."""
+    train: Callable[..., Run]
+    """(trial, *arguments(trial)) -> its run; called in another process, so a function of a module."""
+    arguments: Callable[[Any], tuple[Any, ...]]
+    """Trial -> further arguments of `train`, for instance the scene's folder; called in this process."""
 
 
-def _end_with_parent() -> None:
-    """Should the process that gives out the work be killed, its workers end too instead of waiting for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+def list_trials(experiment: Experiment, output_dir: Path) -> None:
+    """Print the names of the trials that are known yet, and how many of them are pending."""
+    result = load_or_create(output_dir / "result.json", experiment)
+    trials = experiment.trials(result["runs"])
+    for trial in trials:
+        print(trial.name)
+    print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
 
 
-def default_workers() -> int:
-    """As many as CPUs that this process may use; a GPU is one worker's."""
-    if torch.cuda.is_available():
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def begun(path: Path, settings: Any) -> dict[str, Any]:
-    """What an earlier call has left in a result.json, if it had the same settings (a dataclass) and version.
+def run_experiment(experiment: Experiment, output_dir: Path, new_executor: Callable[[], Executor]) -> dict[str, Any]:
+    """Train every pending trial; result.json is written after each.
 
     Raises:
-        InputError: it had not, or is no result.
+        InputError: the folder cannot be written, or holds a result of other settings.
     """
-    told = json.loads(json.dumps(asdict(settings)))
-    if not path.exists():
-        return {"version": VERSION, "settings": told, "machine": machine(), "runs": [], "errors": []}
-    try:
-        result = json.loads(path.read_text(encoding="utf-8"))
-        version, found = result["version"], result["settings"]
-        if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
-            raise TypeError("runs and errors are lists of objects")
-    except (OSError, ValueError, KeyError, TypeError) as problem:
-        raise InputError(f"{path}: not a result of this command ({problem!r})") from problem
-    if version != VERSION or found != told:
-        raise InputError(f"{path}: is of another version or size; name another --output-dir, or move it away")
+    path = output_dir / "result.json"
+    result = load_or_create(path, experiment)
+    trials = experiment.trials(result["runs"])
+    make_folder(output_dir, "--output-dir")
+    result["errors"] = []
+    while pending(trials, result):
+        run_trials(trials, result, path, new_executor, experiment)
+        trials = experiment.trials(result["runs"])
+    for error in result["errors"]:
+        print(", ".join(str(value) for value in error.values()))
+    print(f"{len(result['runs'])} trainings; see {output_dir / 'README.md'}")
     return result
 
 
-def missing(cells: Sequence[Any], result: dict[str, Any]) -> list[Any]:
-    """The cells that a result has neither trained nor told the failure of."""
-    runs = [*result["runs"], *result["errors"]]
-    keys = list(asdict(cells[0])) if cells else []
-    done = {tuple(run.get(key) for key in keys) for run in runs}
-    return [cell for cell in dict.fromkeys(cells) if tuple(asdict(cell).values()) not in done]
+def load_or_create(path: Path, experiment: Experiment) -> dict[str, Any]:
+    """The result of an earlier call with the same settings, or an empty one.
 
-
-def run_cells(
-    cells: Sequence[Any],
-    result: dict[str, Any],
-    path: Path,
-    new_executor: Callable[[], Executor],
-    train: Train,
-    arguments: Callable[[Any], tuple[Any, ...]],
-    keep: Callable[[Any, dict[str, Any]], dict[str, Any]] = lambda _, run: run,
-) -> None:
-    """Train every cell that the result lacks, and write it after each.
-
-    A cell that fails is told in `errors`, tried again by the next call, and stops no other.
-
-    Args:
-        result: of `begun`; changed.
-        path: its result.json.
-        arguments: cell -> what `train` gets besides it.
-        keep: cell, run -> what the result keeps of it.
+    Raises:
+        InputError: the file is no result, or one of another version, experiment or settings.
     """
-    result["errors"] = []
-    progress = Progress(len(cells), "training", start=len(cells) - len(missing(cells, result)))
-    for _ in range(BROKEN_POOLS):
-        todo = missing(cells, result)
-        if not todo:
-            break
-        with new_executor() as executor:
-            place = {executor.submit(train, cell, *arguments(cell)): cell for cell in todo}
-            try:
-                for future in as_completed(place):
-                    _take(result, place[future], future, keep)
-                    write_result(path, result)
-                    progress.update(len(cells) - len(missing(cells, result)))
-            except BaseException as problem:
-                for future in place:
-                    future.cancel()
-                if isinstance(problem, BrokenExecutor):
-                    continue
-                for child in multiprocessing.active_children():  # what they do is lost in any case
-                    child.terminate()
-                raise
-        break
-    for cell in missing(cells, result):
-        result["errors"].append({**asdict(cell), "error": "its process, or one beside it, was killed again and again"})
-    progress.close()
-    write_result(path, result)
+    settings = json.loads(json.dumps(asdict(experiment.settings)))
+    if not path.exists():
+        command = shlex.join(["edge-se", *sys.argv[1:]])
+        head = {"version": VERSION, "experiment": experiment.name, "command": command, "settings": settings}
+        return head | {"machine": machine(), "errors": [], "runs": []}
+    result = read_result(path)
+    if result["experiment"] != experiment.name or result["settings"] != settings:
+        raise InputError(f"{path}: of another experiment or other settings; name another --output-dir, or move it away")
+    return result
 
 
-def _take(result: dict[str, Any], cell: Any, future: Any, keep: Callable[..., dict[str, Any]]) -> None:
-    """A finished cell into the result."""
-    problem = future.exception()
-    if isinstance(problem, (BrokenExecutor, KeyboardInterrupt)):
-        raise problem
-    if problem is not None:
-        result["errors"].append({**asdict(cell), "error": f"{type(problem).__name__}: {problem}"})
-        return
-    result["runs"].append(keep(cell, future.result()))
-    result["runs"].sort(key=lambda run: [run[key] for key in asdict(cell)])
+def read_result(path: Path) -> dict[str, Any]:
+    """A result.json.
+
+    Raises:
+        InputError: it cannot be read, or is no result of this version.
+    """
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+        if result["version"] != VERSION:
+            raise ValueError(f"version {result['version']}, not {VERSION}")
+        if not {"experiment", "settings", "machine"} <= result.keys():
+            raise KeyError("experiment, settings or machine")
+        if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
+            raise TypeError("runs and errors are lists of objects")
+    except (OSError, ValueError, KeyError, TypeError) as problem:
+        raise InputError(f"{path}: not a result of edge-se bench ({problem!r})") from problem
+    return result
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
@@ -181,3 +124,112 @@ def write_result(path: Path, result: dict[str, Any]) -> None:
     head = json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=1, allow_nan=False)
     runs = ",\n".join(json.dumps(run, allow_nan=False) for run in result["runs"])
     write_atomically(path, f'{head[:-2]},\n "runs": [\n{runs}\n ]\n}}\n'.encode())
+
+
+def pending(trials: Sequence[Any], result: dict[str, Any]) -> list[Any]:
+    """The trials that have neither a run nor an error in the result."""
+    done = [*result["runs"], *result["errors"]]
+    keys = list(asdict(trials[0])) if trials else []
+    finished = {tuple(run.get(key) for key in keys) for run in done}
+    return [trial for trial in dict.fromkeys(trials) if tuple(asdict(trial).values()) not in finished]
+
+
+def run_trials(
+    trials: Sequence[Any],
+    result: dict[str, Any],
+    path: Path,
+    new_executor: Callable[[], Executor],
+    experiment: Experiment,
+) -> None:
+    """Train the pending ones of some trials. One that fails goes to `errors`, is tried again by the next call of the
+    command, and stops no other."""
+    progress = Progress(len(trials), experiment.name, start=len(trials) - len(pending(trials, result)))
+    for _ in range(MAX_BROKEN_POOLS):
+        todo = pending(trials, result)
+        if not todo:
+            break
+        with new_executor() as executor:
+            trial_of = {executor.submit(experiment.train, t, *experiment.arguments(t)): t for t in todo}
+            try:
+                for future in as_completed(trial_of):
+                    _store(result, trial_of[future], future)
+                    write_result(path, result)
+                    progress.update(len(trials) - len(pending(trials, result)))
+            except BaseException as problem:
+                for future in trial_of:
+                    future.cancel()
+                if isinstance(problem, BrokenExecutor):
+                    continue
+                for child in multiprocessing.active_children():  # their unfinished trials are lost in any case
+                    child.terminate()
+                raise
+        break
+    for trial in pending(trials, result):
+        result["errors"].append({**asdict(trial), "error": "its process, or one beside it, was killed repeatedly"})
+    progress.close()
+    write_result(path, result)
+
+
+def _store(result: dict[str, Any], trial: Any, future: Future[Run]) -> None:
+    """Add a finished trial to the runs, or to the errors."""
+    problem = future.exception()
+    if isinstance(problem, (BrokenExecutor, KeyboardInterrupt)):
+        raise problem
+    if problem is not None:
+        result["errors"].append({**asdict(trial), "error": f"{type(problem).__name__}: {problem}"})
+        return
+    result["runs"].append({**asdict(trial), **future.result()})
+    result["runs"].sort(key=lambda run: [run[key] for key in asdict(trial)])
+
+
+def executor_factory(workers: int, scheduler: str | None) -> Callable[[], Executor]:
+    """What makes the executor: processes of this machine, or those of a dask cluster by its scheduler's address.
+
+    Raises:
+        InputError: the [cluster] extra is missing, or nobody answers at the address.
+    """
+    if scheduler is None:
+        spawn = multiprocessing.get_context("spawn")  # a forked torch may hang
+        return lambda: ProcessPoolExecutor(workers, spawn, _initialize_worker)
+    try:
+        from distributed import Client  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputError("--scheduler needs the [cluster] extra: pip install 'edge-se-sampler[cluster]'") from None
+    try:
+        client = Client(scheduler, timeout="10s")
+    except (OSError, ValueError) as problem:
+        raise InputError(f"--scheduler {scheduler}: no dask scheduler answers there ({problem})") from problem
+    return client.get_executor
+
+
+def default_workers() -> int:
+    """As many as CPUs that this process may use; a GPU is one worker's."""
+    if torch.cuda.is_available():
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_in_subprocess(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function returns in a fresh process, whose memory and global state are its own.
+
+    Raises:
+        RuntimeError: that process was killed.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _exit_with_parent) as executor:
+        try:
+            return executor.submit(function, *arguments).result()
+        except BrokenExecutor:
+            raise RuntimeError("its process was killed; is there too little memory?") from None
+
+
+def _initialize_worker() -> None:
+    """Ctrl-C reaches every process of a terminal: only the one that hands out the trials answers it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _exit_with_parent()
+
+
+def _exit_with_parent() -> None:
+    """If the process that hands out the trials is killed, its workers end too instead of waiting for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

@@ -11,30 +11,31 @@ import math
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
+
+from edge_se_sampler.errors import InputError
 
 CONFIDENCE = 0.95
 POWER = 0.8
 
 
-def wilson(failures: int, runs: int) -> tuple[float, float]:
+def require_scipy_stats() -> Any:
+    """scipy.stats.
+
+    Raises:
+        InputError: the [bench] extra is missing.
+    """
+    try:
+        from scipy import stats
+    except ImportError:
+        raise InputError("statistics need the [bench] extra: pip install 'edge-se-sampler[bench]'") from None
+    return stats
+
+
+def wilson_interval(failures: int, runs: int) -> tuple[float, float]:
     """95 % interval of a failure rate (Wilson 1927), of independent runs."""
-    z = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
-    share = failures / runs
-    middle = (share + z * z / (2 * runs)) / (1 + z * z / runs)
-    half = z / (1 + z * z / runs) * math.sqrt(share * (1 - share) / runs + z * z / (4 * runs * runs))
-    return max(0.0, middle - half), min(1.0, middle + half)
-
-
-def t_quantile(p: float, df: int) -> float:
-    """Quantile of Student's t, within 1e-3 for df >= 4 (Abramowitz and Stegun, 26.7.5)."""
-    z = statistics.NormalDist().inv_cdf(p)
-    terms = (
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
-    )
-    return z + sum(term / df**power for power, term in enumerate(terms, start=1))
+    interval = require_scipy_stats().binomtest(failures, runs).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,10 @@ class PairedDifference:
 
 
 def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDifference:
-    """Of (scene, d) of every pair; of none, all is 0 and unknown.
+    """Of (scene, d) of every pair; of no pairs, all is 0 and unknown.
 
-    The scenes are what they are and seeds are drawn: only the deviation between a scene's seeds counts, pooled over
-    the scenes. The interval is about these scenes, not about others.
+    The scenes are fixed and seeds are drawn: only the deviation between a scene's seeds counts, pooled over the
+    scenes. The interval is about these scenes, not about others.
     """
     by_scene: dict[str, list[float]] = {}
     for scene, difference in differences:
@@ -73,6 +74,12 @@ def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDiffere
         return PairedDifference(mean, None, None, None, runs, better, len(means))
     variance = sum((d - means[scene]) ** 2 for scene, values in by_scene.items() for d in values) / df
     error = math.sqrt(variance * sum(1 / len(values) for values in by_scene.values())) / len(means)
-    reach = t_quantile(0.5 + CONFIDENCE / 2, df)
-    detectable = (reach + t_quantile(POWER, df)) * error
+    t = require_scipy_stats().t(df)
+    reach = float(t.ppf(0.5 + CONFIDENCE / 2))
+    detectable = (reach + float(t.ppf(POWER))) * error
     return PairedDifference(mean, mean - reach * error, mean + reach * error, detectable, runs, better, len(means))
+
+
+def rank_correlation(first: Any, second: Any) -> float:
+    """Spearman's correlation of two arrays of scores."""
+    return float(require_scipy_stats().spearmanr(first, second).statistic)

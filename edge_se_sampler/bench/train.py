@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.outcomes import judged
+from edge_se_sampler.bench.outcome import judged
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate, get_background_color
 from edge_se_sampler.engine.files import png_bytes

@@ -31,8 +31,8 @@ import torch
 
 from edge_se_sampler.bench.baselines.results import ProgramName, read_external
 from edge_se_sampler.bench.chart.train import LOOKS, Scale
+from edge_se_sampler.bench.experiment import alone
 from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.bench.runner import alone
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.evaluation import measures, pictures_of
 from edge_se_sampler.engine.files import write_json

@@ -46,7 +46,7 @@ class BenchChart:
         from edge_se_sampler.bench.chart.outputs import write_outputs
         from edge_se_sampler.bench.chart.train import Scale, run_cell
         from edge_se_sampler.bench.chart.variants import VARIANTS, cells
-        from edge_se_sampler.bench.runner import alone, begun, default_workers, missing, run_cells
+        from edge_se_sampler.bench.experiment import alone, begun, default_workers, missing, run_cells
         from edge_se_sampler.engine.figures import require_pyplot
         from edge_se_sampler.engine.files import make_folder
 

@@ -10,7 +10,7 @@ from edge_se_sampler.bench.chart.draw import draw_chart, draw_costs, draw_parts,
 from edge_se_sampler.bench.chart.report import report
 from edge_se_sampler.bench.chart.summary import front, table
 from edge_se_sampler.bench.chart.train import Scale
-from edge_se_sampler.bench.runner import write_result
+from edge_se_sampler.bench.experiment import write_result
 from edge_se_sampler.engine.figures import save_figure
 from edge_se_sampler.engine.files import write_atomically
 

@@ -20,7 +20,7 @@ import torch
 
 from edge_se_sampler.bench.chart.variants import Cell, config_of
 from edge_se_sampler.bench.machine import resident_memory
-from edge_se_sampler.bench.outcomes import judged
+from edge_se_sampler.bench.outcome import judged
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_color, psnr, render_rays, target_image
 from edge_se_sampler.engine.session import prepare, test_pictures

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.experiment import write_result
 from edge_se_sampler.bench.paper.figures import Experiment, draw_figures
 from edge_se_sampler.bench.paper.report import report
 from edge_se_sampler.bench.paper.scenes import DataOf
 from edge_se_sampler.bench.paper.tables import markdown
 from edge_se_sampler.bench.paper.trials import Cell
 from edge_se_sampler.bench.paper.verdicts import verdicts
-from edge_se_sampler.bench.runner import write_result
 from edge_se_sampler.engine.files import write_atomically
 
 

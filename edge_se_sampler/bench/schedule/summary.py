@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from edge_se_sampler.bench.experiment import write_result
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.paper.trials import TABLES
-from edge_se_sampler.bench.runner import write_result
 from edge_se_sampler.bench.schedule.trials import CONFIGURATIONS, FRACTIONS, LENGTHS, OF_LENGTHS, choice_seeds
-from edge_se_sampler.bench.statistics import paired_difference, wilson
+from edge_se_sampler.bench.statistics import paired_difference, wilson_interval
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import write_atomically
 
@@ -48,7 +48,7 @@ def failures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     told: dict[str, Any] = {"pairs": len(pairs)}
     for arm in ("random", "auto"):
         told[arm] = count(arm, pairs)
-        told[f"{arm}_interval"] = [round(bound, 4) for bound in wilson(told[arm], len(pairs))]
+        told[f"{arm}_interval"] = [round(bound, 4) for bound in wilson_interval(told[arm], len(pairs))]
         told[f"{arm}_psnr"] = statistics.mean(place[(*pair, arm)]["psnr"] for pair in pairs)
     told["revived"] = sum(place[(*pair, "auto")]["revived"] > 0 for pair in pairs)
     told["configurations"] = [

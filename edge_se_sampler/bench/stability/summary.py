@@ -9,9 +9,9 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.bench.runner import write_result
+from edge_se_sampler.bench.experiment import write_result
 from edge_se_sampler.bench.stability.settings import STRATEGIES, points
-from edge_se_sampler.bench.statistics import wilson
+from edge_se_sampler.bench.statistics import wilson_interval
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import write_atomically
 
@@ -60,7 +60,7 @@ def totals(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
             if not mine:
                 continue
             failures = sum(run["outcome"] != "learnt" for run in mine)
-            low, high = wilson(failures, len(mine))
+            low, high = wilson_interval(failures, len(mine))
             told.append(
                 {
                     "point": number,

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.bench.outcomes import outcome
+from edge_se_sampler.bench.outcome import outcome
 from edge_se_sampler.bench.stability.scenes import COLORS, behind, views
 from edge_se_sampler.bench.stability.settings import STRATEGIES, Cell, Point, points
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig

@@ -1,0 +1,75 @@
+"""What the commands of all experiments have in common. Torch-free until one runs."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from edge_se_sampler.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from edge_se_sampler.bench.runner import Experiment
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentCommand(ABC):
+    """Trains what its result.json lacks, then writes the report."""
+
+    output_dir: Path
+    """Where result.json, README.md and pictures go; trainings that it already has are kept."""
+    workplace: Path = Path("bench")
+    """Where scenes, runs and renderings are kept; workers on other machines must see it."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of weights, pixels and jitter."""
+    workers: int | None = None
+    """Trainings at once, one thread each; left out, as many as there are cores, or one where there is a GPU."""
+    scheduler: str | None = None
+    """Address of a dask scheduler whose workers train ([cluster] extra), instead of --workers; start those with
+    one thread each, for CPU seconds are a process's."""
+    dry_run: tyro.conf.UseCounterAction[int] = 0
+    """Only list the trainings and how many are pending; trains nothing, writes nothing."""
+
+    @abstractmethod
+    def experiment(self) -> Experiment:
+        """What is trained.
+
+        Raises:
+            InputError: a flag's value has no meaning.
+        """
+
+    def run(self) -> None:
+        """Train and report.
+
+        Raises:
+            InputError: as `experiment`, `run_experiment` and `write_report`.
+        """
+        from edge_se_sampler.bench.report import write_report
+        from edge_se_sampler.bench.runner import list_trials, run_experiment
+        from edge_se_sampler.bench.statistics import require_scipy_stats
+        from edge_se_sampler.engine.figures import require_pyplot
+
+        if not self.seeds:
+            raise InputError("--seeds: give at least one")
+        experiment = self.experiment()
+        if self.dry_run:
+            list_trials(experiment, self.output_dir)
+            return
+        require_pyplot()
+        require_scipy_stats()
+        run_experiment(experiment, self.output_dir, self.executor())
+        write_report(self.output_dir, workplace=self.workplace)
+
+    def executor(self) -> Callable[[], Executor]:
+        """What makes the executor that --workers or --scheduler name."""
+        from edge_se_sampler.bench.runner import default_workers, executor_factory
+
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--workers is {self.workers}: give at least one")
+        return executor_factory(self.workers or default_workers(), self.scheduler)

@@ -1,0 +1,33 @@
+"""Synthetic scenes of the experiments, rendered once into a folder and found there afterwards."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from edge_se_sampler.data.synthetic.folder import make_scenes
+from edge_se_sampler.engine.progress import Progress
+
+
+def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
+    """The Blender folder of a synthetic scene in workplace/scenes, rendered if it is not there.
+
+    Args:
+        name: one of the seven.
+        options: of `make_scenes`: size, placement, num_train, ...; scenes of other options lie in other folders.
+
+    Raises:
+        InputError: an unknown scene or option value, or a folder that cannot be written.
+    """
+    words = [f"{key}-{value}" for key, value in sorted(options.items()) if key != "progress"]
+    folder = workplace / "scenes" / ("_".join(words) or "default")
+    if not (folder / name).exists():
+        progress = Progress(0, f"rendering {name}")
+
+        def update(done: int, total: int) -> None:
+            progress.total = total
+            progress.update(done)
+
+        make_scenes(folder, [name], progress=update, **options)
+        progress.close()
+    return folder / name
