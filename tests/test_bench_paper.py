@@ -24,7 +24,8 @@ from edge_se_sampler.bench.paper.scenes import check_real, real_scenes, syntheti
 from edge_se_sampler.bench.paper.trials import PAPERS, PRESETS, TABLES, Cell, Preset, cells, config_of, run_cell
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
-from edge_se_sampler.engine.evaluation import measures, pictures_of
+from edge_se_sampler.engine.evaluation import pictures_of
+from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.run_folder import config_from_json, config_to_json
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
@@ -93,9 +94,9 @@ def test_the_background_alone_has_learnt_nothing(scene: Path) -> None:
     background = background_measures(pictures, 1.0)
     alone = {"images": background}
     assert foreground_share(alone, background) == pytest.approx(1)
-    perfect = {"images": [measures(_seen(picture), picture, 1.0) for picture in pictures]}
+    perfect = {"images": [compute_metrics(_seen(picture), picture.image, 1.0) for picture in pictures]}
     assert foreground_share(perfect, background) < 1e-6
-    half = {"images": [measures((1 + _seen(picture)) / 2, picture, 1.0) for picture in pictures]}
+    half = {"images": [compute_metrics((1 + _seen(picture)) / 2, picture.image, 1.0) for picture in pictures]}
     assert foreground_share(half, background) == pytest.approx(0.25)
 
 

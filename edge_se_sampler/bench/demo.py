@@ -13,9 +13,10 @@ from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MachineConfig
-from edge_se_sampler.engine.evaluation import Picture, evaluate, pictures_of, psnr, target_image
+from edge_se_sampler.engine.evaluation import Picture, evaluate, pictures_of
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import make_folder, write_json
+from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
@@ -60,7 +61,7 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
     test, validation = pictures_of(read_blender(scene, "test")), pictures_of(read_blender(scene, "val"))
     background = float(np.mean([_background_psnr(picture) for picture in test]))
     _write_json(output_dir / "demo.json", outcomes, background, seed, time.monotonic() - began)
-    _draw(output_dir / "demo.png", outcomes, target_image(test[0], 1.0), _background_psnr(validation[0]))
+    _draw(output_dir / "demo.png", outcomes, composite_on(test[0].image), _background_psnr(validation[0]))
     return outcomes
 
 
@@ -111,7 +112,7 @@ def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
 
 def _background_psnr(picture: Picture) -> float:
     """PSNR of answering with the white background alone."""
-    return psnr(float(((target_image(picture, 1.0) - 1.0) ** 2).mean()))
+    return psnr(float(((composite_on(picture.image) - 1.0) ** 2).mean()))
 
 
 def _write_json(path: Path, outcomes: list[Outcome], background: float, seed: int, seconds: float) -> None:

@@ -10,15 +10,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edge_se_sampler.engine.evaluation import Picture, measures
+from edge_se_sampler.engine.evaluation import Picture
+from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.errors import InputError
 
 Outcome = Literal["learnt", "slow", "background"]
 
 
 def background_measures(pictures: list[Picture], shade: float) -> list[dict[str, float | None]]:
-    """`measures` of answering every view with the background alone."""
-    return [measures(np.full((*p.image.shape[:2], 3), shade), p, shade) for p in pictures]
+    """`compute_metrics` of answering every view with the background alone."""
+    return [compute_metrics(np.full((*p.image.shape[:2], 3), shade), p.image, shade) for p in pictures]
 
 
 def foreground_share(results: dict[str, Any], background: list[dict[str, float | None]]) -> float:

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edge_se_sampler.engine.evaluation import Picture, measures
+from edge_se_sampler.engine.evaluation import Picture
+from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.errors import InputError
 
 Outcome = Literal["converged", "underfit", "collapsed"]
@@ -34,8 +35,8 @@ def failed(run: dict[str, Any]) -> bool:
 
 
 def measure_background(pictures: list[Picture], color: float) -> list[dict[str, float | None]]:
-    """`measures` of answering every view with a plain grey background (0 black, 1 white)."""
-    return [measures(np.full((*p.image.shape[:2], 3), color), p, color) for p in pictures]
+    """`compute_metrics` of answering every view with a plain grey background (0 black, 1 white)."""
+    return [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
 
 
 def foreground_share(results: dict[str, Any], background: list[dict[str, float | None]]) -> float:

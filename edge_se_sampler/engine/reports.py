@@ -14,9 +14,9 @@ from edge_se_sampler.engine.evaluation import (
     get_background_color,
     pictures_of,
     render_rays,
-    target_image,
 )
 from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
+from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_views, test_pictures
@@ -40,7 +40,7 @@ def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) 
     def each(i: int, picture: Picture, rendered: np.ndarray) -> None:
         progress.update(i + 1)
         if render_output_path is not None:
-            pair = np.concatenate((target_image(picture, get_background_color(model)), rendered), axis=1)
+            pair = np.concatenate((composite_on(picture.image, get_background_color(model)), rendered), axis=1)
             write_image(render_output_path / f"{i:04d}.png", pair)
 
     results = evaluate(model, pictures, each)

@@ -10,6 +10,7 @@ import torch
 from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import image_batch
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
+from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.distribution import PixelTable
 from edge_se_sampler.sampling.edges import luma, unit_float
@@ -57,10 +58,7 @@ def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Pa
 def _show_view(axes, views: Views, k: int, p: np.ndarray, strategy: str, count: int, rng: np.random.Generator) -> None:
     image = unit_float(views.images[k])
     height, width = p.shape
-    color = image[..., :3]
-    if image.shape[2] == 4:
-        color = color * image[..., 3:] + 1 - image[..., 3:]
-    axes[0].imshow(color, interpolation="nearest")
+    axes[0].imshow(composite_on(image), interpolation="nearest")
     axes[0].set_title(f"view {k}: {views.names[k]}", fontsize=9)
     relative = p * max(np.count_nonzero(p), 1)
     shown = axes[1].imshow(relative, cmap="magma", interpolation="nearest", vmin=0)

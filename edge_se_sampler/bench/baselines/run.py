@@ -34,8 +34,9 @@ from edge_se_sampler.bench.chart.train import LOOKS, Scale
 from edge_se_sampler.bench.experiment import alone
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.engine.evaluation import measures, pictures_of
+from edge_se_sampler.engine.evaluation import pictures_of
 from edge_se_sampler.engine.files import write_json
+from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.errors import InputError
 
 NEVER = str(10**9)
@@ -230,7 +231,10 @@ PROGRAMS: dict[ProgramName, Callable[[Task, Path, Clock], None]] = {
 def mean_psnr(rendered: Sequence[np.ndarray], data: Path) -> float:
     """Of the test views (H, W, 3) in front of white, the mean over views."""
     pictures = pictures_of(read_blender(data, "test"))
-    rows = [measures(np.clip(shown, 0, 1), picture, 1.0) for shown, picture in zip(rendered, pictures, strict=True)]
+    rows = [
+        compute_metrics(np.clip(shown, 0, 1), picture.image, 1.0)
+        for shown, picture in zip(rendered, pictures, strict=True)
+    ]
     return statistics.mean(row["psnr"] or 0.0 for row in rows)
 
 

@@ -22,7 +22,8 @@ from edge_se_sampler.bench.chart.variants import Cell, config_of
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.outcome import judged
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_color, psnr, render_rays, target_image
+from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_color, render_rays
+from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.models.ray_model import RayModel
@@ -137,7 +138,7 @@ def glance(model: RayModel, pictures: list[Picture]) -> float:
     shade, rows, told = get_background_color(model), slice(None, None, LOOKED_AT), []
     for picture in pictures:
         rendered = render_rays(model, picture.rays(model.device)[rows]).clamp(0, 1).double()
-        truth = torch.from_numpy(target_image(picture, shade)).reshape(-1, 3)[rows]
+        truth = torch.from_numpy(composite_on(picture.image, shade)).reshape(-1, 3)[rows]
         told.append(psnr(float((rendered - truth).square().mean())))
     return statistics.mean(told)
 

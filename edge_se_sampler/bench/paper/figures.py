@@ -18,8 +18,8 @@ from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.trials import PAPERS, TABLES, Cell
 from edge_se_sampler.bench.paper.verdicts import LABEL, failed
 from edge_se_sampler.data.blender import Views, read_blender
-from edge_se_sampler.engine.evaluation import edge_band
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
+from edge_se_sampler.engine.metrics import edge_band
 from edge_se_sampler.sampling.edges import edge_strength, unit_float
 
 COLORS = {"vanilla-nerf": "#1f77b4", "precrop-nerf": "#ff7f0e", "edge-nerf": "#2ca02c"}

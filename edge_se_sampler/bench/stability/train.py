@@ -21,8 +21,9 @@ from edge_se_sampler.bench.outcome import outcome
 from edge_se_sampler.bench.stability.scenes import COLORS, behind, views
 from edge_se_sampler.bench.stability.settings import STRATEGIES, Cell, Point, points
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, pictures_of, psnr, render_rays
+from edge_se_sampler.engine.evaluation import Picture, pictures_of, render_rays
 from edge_se_sampler.engine.files import png_bytes, write_atomically
+from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.resolve import resolve_config

@@ -1,0 +1,85 @@
+"""Image metrics of novel view synthesis. Images are (H, W, 3|4) floats in [0, 1], alpha straight.
+
+mse   mean squared error over pixels and channels
+PSNR  -10 log10(mse), in dB
+SSIM  structural similarity (Wang et al. 2004)
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from edge_se_sampler.sampling.edges import edge_strength
+
+EDGE_BAND_FRACTION = 0.1
+"""Pixels with the strongest Sobel response that make up the edge band, together with their neighbors."""
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+"""Side and standard deviation of SSIM's Gaussian window, in pixels."""
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def composite_on(image: np.ndarray, background_color: float = 1.0) -> np.ndarray:
+    """The image in front of a gray background (1: white), (H, W, 3)."""
+    if image.shape[2] == 3:
+        return image
+    return image[..., :3] * image[..., 3:] + background_color * (1 - image[..., 3:])
+
+
+def psnr(mse: float) -> float:
+    """Mean squared error -> dB; an exact match counts as 100 dB, so that results stay valid json."""
+    return 100.0 if mse <= 1e-10 else -10 * math.log10(mse)
+
+
+def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
+    """Mean over pixels and channels of the structural similarity of two (H, W, 3) images.
+
+    As Wang et al. define it: a Gaussian window, and no pixel whose window leaves the image. None for images with a side
+    shorter than the window: they have no such pixel.
+    """
+    if min(first.shape[:2]) < SSIM_WINDOW:
+        return None
+    border = SSIM_WINDOW // 2
+
+    def local_mean(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values, (SSIM_WINDOW, SSIM_WINDOW), SSIM_SIGMA)[border:-border, border:-border]
+
+    x, y = first.astype(np.float64), second.astype(np.float64)
+    mean_x, mean_y = local_mean(x), local_mean(y)
+    variances = local_mean(x * x) - mean_x**2 + local_mean(y * y) - mean_y**2
+    covariance = local_mean(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    return float((luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean())
+
+
+def edge_band(image: np.ndarray) -> np.ndarray:
+    """Where an image (H, W, 3) has its strongest edges and their neighbors, (H, W) bool; nowhere in a flat one."""
+    edges = edge_strength(image)
+    band = edges >= max(float(np.quantile(edges, 1 - EDGE_BAND_FRACTION)), 1e-6)
+    return cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+def compute_metrics(rendered: np.ndarray, image: np.ndarray, background_color: float) -> dict[str, float | None]:
+    """All metrics of a rendering (H, W, 3) of an image; None where there is nothing to measure (no alpha, no object).
+
+    Returns:
+        mse, psnr, ssim, foreground_psnr (where alpha > 0), edge_band_psnr, background_mse (where alpha = 0).
+    """
+    target = composite_on(image, background_color)
+    error = ((rendered.astype(np.float64) - target) ** 2).mean(axis=2)
+    foreground = image[..., 3] > 0 if image.shape[2] == 4 else None
+
+    def psnr_of(pixels: np.ndarray | None) -> float | None:
+        return None if pixels is None or not pixels.any() else psnr(error[pixels].mean())
+
+    background = None if foreground is None or foreground.all() else error[~foreground]
+    return {
+        "mse": float(error.mean()),
+        "psnr": psnr(error.mean()),
+        "ssim": ssim(rendered, target),
+        "foreground_psnr": psnr_of(foreground),
+        "edge_band_psnr": psnr_of(edge_band(target)),
+        "background_mse": None if background is None else float(background.mean()),
+    }
