@@ -16,7 +16,7 @@ import tyro
 
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig, check_fineness
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
@@ -137,7 +137,8 @@ class Resume:
         from edge_se_sampler.engine.run_folder import RunFolder
         from edge_se_sampler.engine.session import prepare_resume
 
-        _train(prepare_resume(RunFolder(self.run_folder), self.max_seconds))
+        run = RunFolder(self.run_folder)
+        _train(prepare_resume(run, run.config(method_configs()), self.max_seconds))
 
 
 @dataclass(frozen=True)
@@ -153,8 +154,10 @@ class Eval:
 
     def run(self) -> None:
         from edge_se_sampler.engine.reports import evaluate_run
+        from edge_se_sampler.engine.run_folder import RunFolder
 
-        results = evaluate_run(self.run_folder, self.output_path, self.render_output_path)
+        run = RunFolder(self.run_folder)
+        results = evaluate_run(run, run.config(method_configs()), self.output_path, self.render_output_path)
         print(f"PSNR {results['psnr']:.2f} dB over {results['num_images']} views; see {self.output_path}")
 
 
@@ -175,8 +178,11 @@ class Render:
 
     def run(self) -> None:
         from edge_se_sampler.engine.reports import render_run
+        from edge_se_sampler.engine.run_folder import RunFolder
 
-        render_run(self.run_folder, self.output_path, self.kind, self.num_frames, self.frames_per_second)
+        run = RunFolder(self.run_folder)
+        config = run.config(method_configs())
+        render_run(run, config, self.output_path, self.kind, self.num_frames, self.frames_per_second)
         print(self.output_path)
 
 

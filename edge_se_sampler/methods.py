@@ -2,7 +2,7 @@
 Torch-free.
 
 A package adds a method with an entry point of the group edge_se_sampler.method_configs that names a
-`protocol.MethodSpecification`.
+`engine.config.MethodSpecification`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig
+from edge_se_sampler.engine.config import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
 from edge_se_sampler.models.config import InfoNeRFModelConfig, LeanModelConfig, NeRFModelConfig
-from edge_se_sampler.protocol import MethodSpecification
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 ENTRY_POINT_GROUP = "edge_se_sampler.method_configs"
@@ -88,3 +87,8 @@ def registered_methods() -> dict[str, RegisteredMethod]:
             continue
         methods[name] = RegisteredMethod(specification, origin)
     return methods
+
+
+def method_configs() -> dict[str, TrainerConfig]:
+    """The default settings of every registered method, by its name."""
+    return {name: method.specification.config for name, method in registered_methods().items()}

@@ -12,12 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar
-
-if TYPE_CHECKING:
-    from edge_se_sampler.engine.config import TrainerConfig
-    from edge_se_sampler.engine.pipeline import Pipeline
-    from edge_se_sampler.engine.trainer import Trainer
+from typing import Any, ClassVar, Protocol
 
 
 class InstantiateConfig:
@@ -80,38 +75,56 @@ class PixelSampler(ABC):
             number, row, column.
         """
 
+    def state_dict(self) -> dict[str, Any]:
+        """What later draws depend on besides the step, for a checkpoint; here nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:  # noqa: B027 (nothing to load by default)
+        """Continue from what `state_dict` returned."""
+
 
 class TrainingCallbackLocation(Enum):
-    """When a callback runs."""
+    """When a callback runs, relative to a training iteration."""
 
     BEFORE_TRAIN_ITERATION = auto()
     AFTER_TRAIN_ITERATION = auto()
 
 
+class CallbackPipeline(Protocol):
+    """The part of a pipeline that callbacks use."""
+
+    @property
+    def model(self) -> Any:
+        """The model being trained."""
+
+
+class CallbackTrainer(Protocol):
+    """The part of a trainer that callbacks use."""
+
+    planned_steps: int
+    """Length of the run as first planned; resuming does not change it."""
+
+    @property
+    def config(self) -> Any:
+        """The run's settings; `config.machine.seed` among them."""
+
+
 @dataclass(frozen=True)
 class TrainingCallbackAttributes:
-    """What a callback may reach."""
+    """What a callback may use."""
 
-    pipeline: Pipeline
-    trainer: Trainer
+    pipeline: CallbackPipeline
+    trainer: CallbackTrainer
 
 
 @dataclass(frozen=True)
 class TrainingCallback:
-    """A function of the step that training calls. func(step=...)."""
+    """A function that training calls with the step: func(step=...)."""
 
     where_to_run: list[TrainingCallbackLocation]
     func: Callable[..., None]
 
     def run_callback_at_location(self, step: int, location: TrainingCallbackLocation) -> None:
-        """Run it if this is one of its places."""
+        """Call the function if this is one of its locations."""
         if location in self.where_to_run:
             self.func(step=step)
-
-
-@dataclass(frozen=True)
-class MethodSpecification:
-    """A named method, as an entry point of the group edge_se_sampler.method_configs offers it."""
-
-    config: TrainerConfig
-    description: str

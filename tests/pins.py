@@ -20,7 +20,7 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, prepare
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
 PINS = Path(__file__).with_name("pins.json")
@@ -47,7 +47,7 @@ def train(method: str, scene: Path, output_dir: Path) -> dict[str, Any]:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        config = registered_methods()[method].specification.config
+        config = method_configs()[method]
         small = {"width": 16, "depth": 2}
         if method != "lean-nerf":
             small |= {"num_coarse_samples": 8, "num_importance_samples": 8}
@@ -62,7 +62,8 @@ def train(method: str, scene: Path, output_dir: Path) -> dict[str, Any]:
         )  # fmt: skip
         trainer.train()
         weights = [weight for group in trainer.optimizer.param_groups for weight in group["params"]]
-        _, loaded, checkpoint = load_model(RunFolder(trainer.run.path))
+        run = RunFolder(trainer.run.path)
+        loaded, checkpoint = load_model(run, run.config(method_configs()))
         assert checkpoint == latest_checkpoint(trainer.run.checkpoints)
         assert digest(weights) == digest(weight for group, _ in loaded.parameter_groups() for weight in group)
         return {

@@ -32,7 +32,7 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_variant_is_a_method_with_its_changes_and_can_be_planned(name: str, made: Path, tmp_path: Path) -> None:
     variant = VARIANTS[name]
     config = config_of(Cell(name, "mic", 5), made, tmp_path)
-    plain = registered_methods()[variant.method].specification.config
+    plain = method_configs()[variant.method]
     assert config.machine.seed == 5
     for path, value in variant.changes.items():
         found, before = config, plain
@@ -61,7 +61,7 @@ def test_a_variant_is_a_method_with_its_changes_and_can_be_planned(name: str, ma
 
 
 def test_changing_a_field_leaves_the_others_and_the_original() -> None:
-    config = registered_methods()["lean-nerf"].specification.config
+    config = method_configs()["lean-nerf"]
     other = changed(config, "pipeline.model.width", 7)
     assert (config.pipeline.model.width, other.pipeline.model.width) == (None, 7)
     assert replace(other, pipeline=config.pipeline) == config

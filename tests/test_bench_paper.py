@@ -28,7 +28,7 @@ from edge_se_sampler.engine.evaluation import pictures_of
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.run_folder import config_from_json, config_to_json
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import InfoNeRFModelConfig
 
 SMALL = Preset("tiny", iterations=4, info_iterations=3, rays=16, image_size=16, num_train=11, num_test=1)
@@ -222,7 +222,7 @@ def test_a_cells_run_can_be_taken_up_again(tmp_path: Path) -> None:
     for table in TABLES:
         cell = next(cell for cell in cells((table,), ("mic",), (), (0,)))
         config = config_of(cell, SMALL, tmp_path, tmp_path)
-        default = registered_methods()[config.method_name].specification.config
+        default = method_configs()[config.method_name]
         assert config_from_json(default, config_to_json(config), "here") == config
 
 

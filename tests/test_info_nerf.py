@@ -23,7 +23,7 @@ from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import InfoNeRFModelConfig
 from edge_se_sampler.models.infonerf import InfoNeRFModel, information_gain, ray_entropy, turn, turned
 from edge_se_sampler.models.rendering import opacity
@@ -221,7 +221,7 @@ def test_the_gain_is_added_to_seen_and_unseen_rays_and_off_by_default() -> None:
 
 
 def trainer_of(method: str, **model: Any) -> Trainer:
-    config = registered_methods()[method].specification.config
+    config = method_configs()[method]
     views = tiny_views(4, 12, 10)
     small = replace(config.pipeline.model, **{"width": 8, "depth": 3, "num_coarse_samples": 6, **model})
     config = resolve_config(

@@ -20,10 +20,9 @@ from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
 from edge_se_sampler.engine.inspection import inspect
-from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, prepare, summary
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import lean
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import UPDATE_INTERVAL, LeanModel
@@ -243,7 +242,7 @@ def larger(tmp_path: Path) -> Path:
 
 
 def lean_config(scene: Path, place: Path, **model: Any) -> TrainerConfig:
-    config: TrainerConfig = registered_methods()["lean-nerf"].specification.config
+    config: TrainerConfig = method_configs()["lean-nerf"]
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=128)
     pipeline = replace(config.pipeline, datamanager=manager, model=replace(config.pipeline.model, **model))
     machine = replace(config.machine, device_type="cpu")
@@ -263,7 +262,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     background = -10 * np.log10(np.mean(away.astype(np.float64) ** 2))
     assert 5 < background < 30
     assert psnr > background + 3
-    _, again, _ = load_model(RunFolder(trainer.run.path))
+    again, _ = load_model(trainer.run, trainer.config)
     rays = picture.rays(model.device)
     assert torch.equal(render_rays(again, rays), render_rays(model, rays))
 

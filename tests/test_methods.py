@@ -40,8 +40,7 @@ def test_the_six_strategies_of_the_paper_and_two_on_its_other_method():
 MODULE = """
 from dataclasses import replace
 from edge_se_sampler.methods import registered_methods  # noqa: F401  (a plugin may look at ours)
-from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.protocol import MethodSpecification
+from edge_se_sampler.engine.config import MethodSpecification, TrainerConfig
 tiny = MethodSpecification(TrainerConfig(method_name="third-party"), "made by somebody else")
 taken = MethodSpecification(TrainerConfig(method_name="vanilla-nerf"), "an impostor")
 nothing = 3

@@ -23,7 +23,7 @@ from pathlib import Path
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import prepare, prepare_resume
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import lean
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
@@ -31,9 +31,10 @@ what, place, data, interrupt_at, method = sys.argv[1:]
 place, data, interrupt_at = Path(place), Path(data), int(interrupt_at)
 lean.UPDATE_INTERVAL, lean.ALPHA_THRESHOLD, lean.MIN_OPTICAL_DEPTH = 5, 0.001, 0.0
 if what == "resume":
-    trainer = prepare_resume(RunFolder(place))
+    run = RunFolder(place)
+    trainer = prepare_resume(run, run.config(method_configs()))
 else:
-    config = registered_methods()[method.split()[0]].specification.config
+    config = method_configs()[method.split()[0]]
     changes = {"early_fraction": 0.7}
     samples = {"num_coarse_samples": 8, "num_importance_samples": 8, "density_noise": 0.1}
     if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered

@@ -19,7 +19,7 @@ from edge_se_sampler.engine.reinitialization import PATIENCE, dead_networks
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.methods import STRATEGIES, registered_methods
+from edge_se_sampler.methods import STRATEGIES, method_configs
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.sampling import schedule
 
@@ -29,7 +29,7 @@ VIEWS = tiny_views(3, 12, 12)
 def trainer_of(
     folder: Path, method: str = "vanilla-nerf", *, reinit_dead: bool = True, seed: int = 0, schedule: str = "fraction"
 ) -> Trainer:
-    config: TrainerConfig = registered_methods()[method].specification.config
+    config: TrainerConfig = method_configs()[method]
     settings: dict[str, Any] = {"schedule": schedule}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=16, pixel_sampler=sampler)

@@ -16,7 +16,7 @@ from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer, adam
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import nerf as model_module
 
 VIEWS = tiny_views(3, 12, 12)
@@ -24,7 +24,7 @@ RAYS = 37
 
 
 def trainer_of(method: str = "edge-se-nerf", steps: int = 20, optimizer: Any = None, **model: Any) -> Trainer:
-    config: TrainerConfig = registered_methods()[method].specification.config
+    config: TrainerConfig = method_configs()[method]
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=RAYS)
     pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(**model))
     optimizer = OptimizerConfig(lr=1e-2) if optimizer is None else optimizer

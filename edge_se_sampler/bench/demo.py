@@ -21,7 +21,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 SCENE = "mic"
 OFFSET = (0.2, 0.15)
@@ -80,7 +80,7 @@ def demo_trainer(method: str, scene: Path, output_dir: Path, seed: int) -> Train
     """What trains one of the demo's methods, its run in output_dir."""
     return prepare(
         replace(
-            registered_methods()[method].specification.config,
+            method_configs()[method],
             data=scene,
             output_dir=output_dir,
             max_num_iterations=ITERATIONS,

@@ -15,7 +15,7 @@ from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.resolve import check_seconds
 from edge_se_sampler.engine.run_folder import config_to_json
 from edge_se_sampler.engine.session import prepare, test_pictures
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 
 def bench_quality(
@@ -35,7 +35,7 @@ def bench_quality(
     check_seconds(seconds, "--seconds")
     make_folder(output_dir, "--output-dir")
     data = scene_in(workplace, scene)
-    config = registered_methods()[method].specification.config
+    config = method_configs()[method]
     trainer = prepare(
         replace(
             config,

@@ -13,7 +13,12 @@ from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.cameras import Cameras, RayBundle, RayGenerator
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from edge_se_sampler.protocol import (
+    PixelSampler,
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
 from edge_se_sampler.sampling.scoring import scoring
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -59,6 +64,16 @@ class VanillaDataManager:
         """Tell the sampler the (N,) squared errors that training found on the last batch."""
         if isinstance(self.train_pixel_sampler, ImportantPixels):
             self.train_pixel_sampler.observe(squared_error)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The pixel sampler's state, for a checkpoint; nothing for a host's sampler that has none."""
+        sampler = self.train_pixel_sampler
+        return sampler.state_dict() if isinstance(sampler, (PixelSampler, ImportantPixels)) else {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned."""
+        if state:
+            self.train_pixel_sampler.load_state_dict(state)
 
     def probe_rays(self, n: int, rng: np.random.Generator) -> RayBundle:
         """n rays, uniform in the training images."""

@@ -78,3 +78,11 @@ class TrainerConfig(InstantiateConfig):
     machine: MachineConfig = field(default_factory=MachineConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+
+
+@dataclass(frozen=True)
+class MethodSpecification:
+    """A named method, as an entry point of the group edge_se_sampler.method_configs offers it."""
+
+    config: TrainerConfig
+    description: str

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.engine.camera_path import spiral
+from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import (
     Picture,
     evaluate,
@@ -24,14 +25,16 @@ from edge_se_sampler.engine.video import check_video, write_video
 from edge_se_sampler.errors import InputError
 
 
-def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) -> dict[str, Any]:
+def evaluate_run(
+    run: RunFolder, config: TrainerConfig, output_path: Path, render_output_path: Path | None
+) -> dict[str, Any]:
     """Measure a run's last checkpoint on its held-out views and write nerfstudio's eval json.
 
     Raises:
         InputError: a bad run, or an output that cannot be written.
     """
     check_output(output_path)
-    config, model, checkpoint = load_model(RunFolder(run))
+    model, checkpoint = load_model(run, config)
     pictures = test_pictures(config)
     if render_output_path is not None:
         make_folder(render_output_path, "--render-output-path")
@@ -55,7 +58,9 @@ def evaluate_run(run: Path, output_path: Path, render_output_path: Path | None) 
     return results
 
 
-def render_run(run: Path, output_path: Path, kind: str, num_frames: int, frames_per_second: int) -> None:
+def render_run(
+    run: RunFolder, config: TrainerConfig, output_path: Path, kind: str, num_frames: int, frames_per_second: int
+) -> None:
     """Render a run's last checkpoint along a spiral or at its held-out cameras, as a video.
 
     Raises:
@@ -64,7 +69,7 @@ def render_run(run: Path, output_path: Path, kind: str, num_frames: int, frames_
     check_video(output_path, frames_per_second)
     if num_frames < 1 or frames_per_second < 1:
         raise InputError("--num-frames and --frames-per-second must be at least 1")
-    config, model, _ = load_model(RunFolder(run))
+    model, _ = load_model(run, config)
     pictures = test_pictures(config)
     if kind == "spiral":
         train = pictures_of(read_views(config))

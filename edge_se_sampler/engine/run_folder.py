@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import write_atomically, write_image, write_json
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,11 @@ class RunFolder:
         """Folder of the checkpoints."""
         return self.path / "checkpoints"
 
-    def config(self) -> TrainerConfig:
+    def config(self, method_configs: Mapping[str, TrainerConfig]) -> TrainerConfig:
         """The run's settings.
+
+        Args:
+            method_configs: the default settings of every method by name; the run's are of the same types.
 
         Raises:
             InputError: no run folder, or its config.json is broken or of another version.
@@ -68,10 +71,10 @@ class RunFolder:
         except (OSError, ValueError) as problem:
             raise InputError(f"{path}: not readable as json ({problem})") from problem
         name = values.get("method_name") if isinstance(values, dict) else None
-        method = registered_methods().get(str(name))
-        if method is None:
+        default = method_configs.get(str(name))
+        if default is None:
             raise InputError(f"{path}: method_name is {name!r}, which is not registered here; see edge-se methods")
-        return config_from_json(method.specification.config, values, f"{path}")
+        return config_from_json(default, values, f"{path}")
 
     def log(self, line: dict[str, Any]) -> None:
         """Append a line to metrics.jsonl.

@@ -38,14 +38,14 @@ def prepare(config: TrainerConfig) -> Trainer:
     return plan.setup(run=RunFolder.create(plan), pipeline=pipeline, preview=preview)
 
 
-def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
-    """Take up an interrupted run under its own settings; max_seconds holds for this session.
+def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
+    """Continue an interrupted run under its own settings (`run.config`); max_seconds holds for this session.
 
     Raises:
         InputError: no such run, no or bad checkpoint, or its data is gone.
     """
     check_seconds(max_seconds)
-    config = dataclasses.replace(run.config(), max_seconds=max_seconds)
+    config = dataclasses.replace(config, max_seconds=max_seconds)
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))  # before anything is built on it
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
@@ -55,18 +55,20 @@ def prepare_resume(run: RunFolder, max_seconds: float | None = None) -> Trainer:
     return trainer
 
 
-def load_model(run: RunFolder) -> tuple[TrainerConfig, RayModel, Path]:
-    """A run's settings, its model with the last checkpoint's weights, and that checkpoint.
+def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
+    """A run's model with the weights of its last checkpoint, and that checkpoint.
+
+    Args:
+        config: the run's settings (`run.config`).
 
     Raises:
-        InputError: no such run, or no or bad checkpoint.
+        InputError: no checkpoint, or a bad one.
     """
-    config = run.config()
     checkpoint = latest_checkpoint(run.checkpoints)
     state = load_checkpoint(checkpoint, config_digest(config))
     model = build_model(config, choose_device(config.machine.device_type))
     model.load_state_dict(state["model"])
-    return config, model, checkpoint
+    return model, checkpoint
 
 
 def test_pictures(config: TrainerConfig) -> list[Picture]:

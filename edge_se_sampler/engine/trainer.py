@@ -64,8 +64,9 @@ class Trainer:
         """
         self.pipeline.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
-        for part, watched in self._watched():
-            watched.load(state[part])
+        self.pipeline.datamanager.load_state_dict(state["sampler"])
+        if self.revival is not None:
+            self.revival.load(state["revival"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
         self.run.forget_after(state["step"])
 
@@ -141,12 +142,6 @@ class Trainer:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return value
 
-    def _watched(self) -> list[tuple[str, Any]]:
-        """What has a state besides the weights, and its name in a checkpoint."""
-        sampler = self.pipeline.datamanager.train_pixel_sampler
-        parts = {"revival": self.revival} | {name: getattr(sampler, name, None) for name in ("watch", "memory")}
-        return [(name, part) for name, part in parts.items() if part is not None]
-
     def _backward(self, rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
         """Add the gradients of a loss's mean over rays, as many rays at a time as are worth rendering; that mean."""
         loss = torch.zeros((), device=self.pipeline.model.device)
@@ -178,7 +173,10 @@ class Trainer:
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-        } | {name: part.state() for name, part in self._watched()}
+            "sampler": self.pipeline.datamanager.state_dict(),
+        }
+        if self.revival is not None:
+            state["revival"] = self.revival.state()
         save_checkpoint(self.run.checkpoints, self.next_step - 1, state)
 
     def _log(self, step: int, loss: float) -> None:

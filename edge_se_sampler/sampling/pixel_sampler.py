@@ -120,6 +120,18 @@ class ImportantPixels:
         kept = 1.0 if pixels["kept"] is None else pixels["kept"][rows].numpy()
         self.watch.observe(*summed_up(error, distance, relative, by_edge=self.strategy == "edge", kept=kept))
 
+    def state_dict(self) -> dict[str, Any]:
+        """What later draws depend on besides the step, for a checkpoint."""
+        parts = {"watch": self.watch, "memory": self.memory}
+        return {name: part.state() for name, part in parts.items() if part is not None}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned."""
+        if self.watch is not None:
+            self.watch.load(state["watch"])
+        if self.memory is not None:
+            self.memory.load(state["memory"])
+
     @property
     def is_bound(self) -> bool:
         """Whether it is bound to a run."""

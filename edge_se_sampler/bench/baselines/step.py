@@ -24,7 +24,7 @@ from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 FORGOTTEN = 2
 """Steps of each before those that count: memory is still being taken from the system."""
@@ -60,7 +60,7 @@ def bench_step(
 
 
 def _ours(pipe: Connection, data: Path, size: Literal["paper", "tiny"], rays: int) -> None:
-    config = registered_methods()["vanilla-nerf"].specification.config
+    config = method_configs()["vanilla-nerf"]
     model = replace(config.pipeline.model, size=size)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=rays)
     pipeline = replace(config.pipeline, model=model, datamanager=manager)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 Group = Literal["methods", "scorings", "sampling", "economy", "size"]
 GROUPS: dict[Group, str] = {
@@ -123,7 +123,7 @@ def changed(config: Any, path: str, value: Any) -> Any:
 def config_of(cell: Cell, data: Path, output_dir: Path) -> TrainerConfig:
     """What a cell trains; its number of iterations is still open."""
     variant = VARIANTS[cell.variant]
-    config: TrainerConfig = registered_methods()[variant.method].specification.config
+    config: TrainerConfig = method_configs()[variant.method]
     for path, value in variant.changes.items():
         config = changed(config, path, value)
     machine = MachineConfig(seed=cell.seed, device_type="cpu")  # seconds are a CPU's

@@ -21,7 +21,7 @@ from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.random_streams import Stream, stream
@@ -143,7 +143,7 @@ def training_peak(method: str, rays: str, size: str, scoring: str) -> int:
     pose[2, 3] = 4
     lens = np.full((8, 2), 100.0)
     views = Views(tuple("abcdefgh"), tuple(noise), None, np.tile(pose, (8, 1, 1)), lens, lens / 2)
-    config = registered_methods()[method].specification.config
+    config = method_configs()[method]
     how = scoring if method == "se-nerf" else "fine"
     sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0, error_source=how)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=int(rays), pixel_sampler=sampler)

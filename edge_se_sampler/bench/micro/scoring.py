@@ -23,7 +23,7 @@ from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 SCORINGS = ("fine", "coarse", "cached")
 COMPARED = 4096
@@ -68,7 +68,7 @@ def bench_scoring(data: Path, size: str, rays: int, rounds: int, learning: int) 
 
 def _trainer(method: str, scoring: str, data: Path, place: Path, size: str, rays: int) -> Trainer:
     """A dense training whose late phase begins at once."""
-    config = registered_methods()[method].specification.config
+    config = method_configs()[method]
     manager = config.pipeline.datamanager
     sampler = replace(manager.pixel_sampler, early_fraction=0.0, error_source=scoring)
     manager = replace(manager, train_num_rays_per_batch=rays, pixel_sampler=sampler)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from edge_se_sampler.bench.paper.published import SCENES, STRATEGIES
 from edge_se_sampler.bench.train import trial
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 
 Method = Literal["nerf", "info-nerf"]
 Placement = Literal["centered", "padded", "shifted"]
@@ -146,9 +146,9 @@ def config_of(cell: Cell, preset: Preset, data: Path, output_dir: Path) -> Train
     """What a cell trains: dense and faithful, nothing culled."""
     table = TABLES[cell.table]
     info = table.method == "info-nerf"
-    methods = registered_methods()
-    config = methods["info-nerf" if info else cell.strategy].specification.config
-    manager = methods[cell.strategy].specification.config.pipeline.datamanager
+    methods = method_configs()
+    config = methods["info-nerf" if info else cell.strategy]
+    manager = methods[cell.strategy].pipeline.datamanager
     sampler = replace(manager.pixel_sampler, **table.sampler)
     manager = replace(manager, train_num_rays_per_batch=preset.rays, pixel_sampler=sampler)
     model = config.pipeline.model

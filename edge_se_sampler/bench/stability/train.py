@@ -30,7 +30,7 @@ from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import keep_freed_memory
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
@@ -88,7 +88,7 @@ def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Pat
         initialization=point.initialization, density_noise=point.noise,
         background_color="random" if point.background == "random" else "white",
     )  # fmt: skip
-    config: TrainerConfig = registered_methods()["edge-se-nerf"].specification.config
+    config: TrainerConfig = method_configs()["edge-se-nerf"]
     settings: dict[str, Any] = {"early": chosen.early, "late": chosen.late, "schedule": chosen.schedule}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=scale.rays, pixel_sampler=sampler)
