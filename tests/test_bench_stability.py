@@ -15,7 +15,7 @@ import torch
 from edge_se_sampler.bench import runner as experiment
 from edge_se_sampler.bench.stability import scenes as scene
 from edge_se_sampler.bench.stability import train as train_module
-from edge_se_sampler.bench.stability.scenes import COLORS, SHIFT, behind, views
+from edge_se_sampler.bench.stability.scenes import COLORS, SHIFT, background_of, views
 from edge_se_sampler.bench.stability.settings import AXES, BASE, PAIRS, STRATEGIES, Cell, Point, cells, points
 from edge_se_sampler.bench.stability.summary import table, totals
 from edge_se_sampler.bench.stability.train import Measured, Scale, ending, measured, portrait, run_cell, trainer_of
@@ -78,8 +78,8 @@ def test_off_centre_is_the_same_picture_elsewhere() -> None:
 
 def test_what_lies_behind() -> None:
     rays = train_module.pictures_of(views(0.05, False, 3)[1])[0].rays(torch.device("cpu"))
-    green, texture = behind("green"), behind("textured")
-    assert behind("random") is None
+    green, texture = background_of("green"), background_of("textured")
+    assert background_of("random") is None
     assert green is not None
     assert texture is not None
     torch.testing.assert_close(green(rays), torch.tensor(scene.COLORS["green"]).expand(len(rays), 3))
@@ -173,7 +173,7 @@ def test_a_point_is_trained_as_it_says(point: Point, tmp_path: Path) -> None:
     assert trainer.pipeline.datamanager.train_pixel_sampler.watch is not None
     assert trainer.revival is not None
     outputs = trainer.pipeline.model(pictures[0].rays(torch.device("cpu"))[:5])
-    expected = behind(point.background)
+    expected = background_of(point.background)
     if expected is not None:
         torch.testing.assert_close(outputs["background"], expected(pictures[0].rays(torch.device("cpu"))[:5]))
     assert np.isfinite(trainer.train_iteration(0))

@@ -93,7 +93,7 @@ def missed(views: Views, hull: Hull) -> int:
     count = 0
     for chunk in torch.from_numpy(pixels).split(4096):
         samples = grid.march(generator(chunk), hull.side / 8, None)
-        count += int((torch.bincount(samples.ray, minlength=len(chunk)) == 0).sum())
+        count += int((torch.bincount(samples.ray_indices, minlength=len(chunk)) == 0).sum())
     return count
 
 
@@ -375,7 +375,7 @@ def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
     dead = 0
     for number, live in enumerate(live_pixels(views, hull)):
         rays = generator.image(number)
-        meets = torch.bincount(grid.march(rays, hull.side / 4, None).ray, minlength=len(rays)).numpy() > 0
+        meets = torch.bincount(grid.march(rays, hull.side / 4, None).ray_indices, minlength=len(rays)).numpy() > 0
         assert not (meets & ~live.reshape(-1)).any()
         dead += (live.reshape(-1) & ~meets).mean()
     assert 0 < dead / VIEWS < 0.1

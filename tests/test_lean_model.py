@@ -44,7 +44,7 @@ def ball(radius: float = 1.0) -> Hull:
 
 def model_in(hull: Hull, **changes: Any) -> LeanModel:
     """A tiny one in float64, its features not all 0."""
-    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, features=3), **changes)
+    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), **changes)
     model = LeanModel(config, np.random.default_rng(0))
     model.settle(OccupancyGrid.of(hull))
     model = model.double()
@@ -146,7 +146,7 @@ def test_a_dense_cell_stays() -> None:
 
 
 def test_without_features_there_is_the_network_alone() -> None:
-    config = LeanModelConfig("tiny", 8, 2, 2, 1, features=0)
+    config = LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=0)
     model = LeanModel(config, np.random.default_rng(0))
     model.settle(OccupancyGrid.of(ball()))
     ((weights, rate),) = model.parameter_groups()
@@ -293,8 +293,8 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
     for flag, value, word in (
         ("--pipeline.model.voxel-size-px", "0", "voxel-size-px is 0.0"),
         ("--pipeline.model.step-size-voxels", "nan", "step-size-voxels is nan"),
-        ("--pipeline.model.features", "-1", "features is -1"),
-        ("--pipeline.model.features", "100000", "between 0 and 64"),
+        ("--pipeline.model.feature-dim", "-1", "feature-dim is -1"),
+        ("--pipeline.model.feature-dim", "100000", "between 0 and 64"),
         ("--pipeline.model.step-size-voxels", "1e-6", "at least 0.05"),
         ("--pipeline.model.voxel-size-px", "1e300", "at most 1000"),
         ("--reinit-dead", "True", "cannot die"),

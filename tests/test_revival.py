@@ -75,16 +75,16 @@ def test_networks_dead_at_the_start_begin_anew_under_every_strategy(method: str,
     ]
 
 
-@pytest.mark.parametrize("dead", NeRFModel.levels)
+@pytest.mark.parametrize("dead", NeRFModel.networks)
 def test_only_the_dead_one_begins_anew(dead: str, tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path)
-    model, (other,) = trainer.pipeline.model, [level for level in NeRFModel.levels if level != dead]
+    model, (other,) = trainer.pipeline.model, [level for level in NeRFModel.networks if level != dead]
     kill(model, dead)
     for step in range(PATIENCE - 1):
         trainer.train_iteration(step)
-    before = {level: weights(model, level) for level in NeRFModel.levels}
+    before = {level: weights(model, level) for level in NeRFModel.networks}
     trainer.train_iteration(PATIENCE - 1)
-    moved = {level: float((weights(model, level) - before[level]).abs().max()) for level in NeRFModel.levels}
+    moved = {level: float((weights(model, level) - before[level]).abs().max()) for level in NeRFModel.networks}
     assert moved[dead] > 0.3  # new weights
     assert 0 < moved[other] < 0.05  # a step of training
     assert trainer.revival is not None

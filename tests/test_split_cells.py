@@ -25,7 +25,7 @@ EARLY = UPDATE_INTERVAL // 2
 
 def open_model(splits: int = 1, **changes: Any) -> LeanModel:
     """In a cube of which nothing is known."""
-    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, features=3), **changes)
+    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), **changes)
     model = LeanModel(config, np.random.default_rng(0))
     model.settle(OccupancyGrid.of(Hull(np.full(3, -1.2), SIDE, np.ones((8, 8, 8), dtype=bool)), splits))
     return model.double().train()
@@ -61,7 +61,7 @@ def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_other
 def test_split_cells_are_none_but_the_hulls() -> None:
     shown = torch.rand((8, 8, 8), generator=torch.Generator().manual_seed(0)) < 0.5
     shown[3:5, 3:5, 3:5] = True
-    model = LeanModel(LeanModelConfig("tiny", 8, 2, 2, 1, features=3), np.random.default_rng(0))
+    model = LeanModel(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), np.random.default_rng(0))
     model.settle(OccupancyGrid.of(Hull(np.full(3, -1.2), SIDE, shown.numpy()), 1, 1))
     assert bool(cells(model).possible[2:4, 2:4, 2:4].all())  # of two cells each, and a rim
     seen(model, 100.0)

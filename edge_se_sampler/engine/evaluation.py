@@ -40,8 +40,8 @@ def pictures_of(views: Views) -> list[Picture]:
 
 
 def get_background_color(model: RayModel) -> float:
-    """The background that a model is evaluated on."""
-    return 0.0 if model.config.background_color == "black" else 1.0
+    """The grey level in [0, 1] of the background that a model is evaluated on."""
+    return model.config.background_level
 
 
 def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:

@@ -66,7 +66,7 @@ def _lines(views: Views, told: SceneAnalysis, live: list[np.ndarray], config: Le
         f"{whole:,.0f} may hold something ({100 * hull.cells.sum() / whole:.1f} %)"
         + (f"; training begins with {first:.4f}, split to {finest:.4f} where it sees any" if told.splits else ""),
         "encoding": f"{model.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; "
-        f"what is finer is left to {model.features} features at every corner of a cell",
+        f"what is finer is left to {model.feature_dim} features at every corner of a cell",
         "network": f"{model.depth} x {model.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size "
         f"{size}, by the images' longer side",
         "rays": f"{100 * across:.1f} % of the pixels may cross them; such a ray has {samples:.1f} samples, {along:.0f} "

@@ -13,9 +13,6 @@ from edge_se_sampler.occupancy.scene_analysis import analyze_scene, live_pixels
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
 
-BACKGROUND_COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "random": (1.0, 1.0, 1.0)}
-"""What a sampler takes to be behind the object; a random background has no edge of its own, and counts as white."""
-
 
 @dataclass(frozen=True)
 class Pipeline:
@@ -39,10 +36,8 @@ class Pipeline:
                 views = views.masked(live_pixels(views, told.hull))
         if isinstance(manager_config.pixel_sampler, SamplingSettings):
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
-        datamanager = manager_config.setup(
-            views=views, device=device, background_color=BACKGROUND_COLORS[model_config.background_color]
-        )
-        return cls(datamanager, model)
+        background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
+        return cls(manager_config.setup(views=views, device=device, background_color=background), model)
 
 
 def build_model(config: TrainerConfig, device: str) -> RayModel:

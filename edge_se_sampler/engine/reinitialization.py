@@ -29,7 +29,7 @@ def dead_networks(model: RayModel, probes: Iterable[RayBundle]) -> list[str]:
     The last interval is endless: the least density anywhere would make its ray opaque.
     """
     parts = list(probes)
-    return [lvl for lvl in model.levels if not any(render_rays(model, r, f"accumulation_{lvl}").any() for r in parts)]
+    return [lvl for lvl in model.networks if not any(render_rays(model, r, f"accumulation_{lvl}").any() for r in parts)]
 
 
 class DeadNetworkReset:
@@ -43,13 +43,13 @@ class DeadNetworkReset:
 
     def __init__(self, model: RayModel, optimizer: torch.optim.Optimizer, probe: RayBundle, seed: int) -> None:
         self.model, self.optimizer, self.probe, self.seed = model, optimizer, probe, seed
-        self.silent = dict.fromkeys(model.levels, 0)
+        self.silent = dict.fromkeys(model.networks, 0)
         self.used = 0
 
     def after_backward(self) -> dict[str, int]:
         """Look at the gradients of a step; the networks that were given new weights, and of which sub-seed."""
         suspects = []
-        for level in self.model.levels:
+        for level in self.model.networks:
             gradient = getattr(self.model, level).density.weight.grad
             self.silent[level] = 0 if gradient.any() else self.silent[level] + 1
             if self.silent[level] >= PATIENCE:

@@ -114,8 +114,8 @@ def _check_nerf(model: NeRFModelConfig) -> None:
 
 
 def _check_lean(plan: TrainerConfig, model: LeanModelConfig) -> None:
-    if not 0 <= model.features <= 64:
-        raise InputError(f"--pipeline.model.features is {model.features}: must be between 0 and 64")
+    if not 0 <= model.feature_dim <= 64:
+        raise InputError(f"--pipeline.model.feature-dim is {model.feature_dim}: must be between 0 and 64")
     if not 0 < model.feature_lr_scale < float("inf"):
         raise InputError(f"--pipeline.model.feature-lr-scale is {model.feature_lr_scale}: must be above 0")
     if plan.reinit_dead:

@@ -26,7 +26,7 @@ class ModelConfig(InstantiateConfig):
     initialization: Literal["xavier", "torch"] = "xavier"
     """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
     background_color: Literal["white", "black", "random"] = "white"
-    """What is behind the scene; random: another colour for every training ray, white in evaluation."""
+    """Background of the scene; random: another colour for every training ray, white in evaluation."""
     near: float = 2.0
     """Depth along the optical axis at which samples begin, world units."""
     far: float = 6.0
@@ -36,6 +36,11 @@ class ModelConfig(InstantiateConfig):
     voxel_size_px: float = 1.0
     """Side of a cell that is kept or left out, in pixels' footprints at the middle of the scene; larger where there
     would be more cells than are worth their memory."""
+
+    @property
+    def background_level(self) -> float:
+        """The evaluation background's red, green and blue, all the same: 0 black, 1 white."""
+        return 0.0 if self.background_color == "black" else 1.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ class LeanModelConfig(ModelConfig):
     """Leave out where training has seen no density; such cells are tried again now and then."""
     step_size_voxels: float = 1.0
     """Distance between samples, in sides of a cell."""
-    features: int = 8
+    feature_dim: int = 8
     """Numbers kept at each corner of a cell; 0: the network alone has to know the scene."""
     feature_lr_scale: float = 6.0
     """Learning rate of the features, in the network's."""

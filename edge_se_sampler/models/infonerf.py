@@ -1,12 +1,12 @@
-"""InfoNeRF (Kim, Seo and Han 2022): rays should be sure of where they end, and near poses should agree.
+"""InfoNeRF (Kim, Seo and Han 2022): rays of low entropy, and nearby poses that agree.
 
 alpha  opacity of each of the fine network's intervals along a ray, (n, s)
-p, q   alpha / (sum alpha + 1e-10): of a ray, and of the same ray turned a little about the origin
+p, q   alpha / (sum alpha + 1e-10): of a ray, and of the same ray rotated a little about the origin
 H      -sum p log2(p + 1e-10), in bits: a ray's entropy
-KL     sum q (log q - log p), in nats, both with 1e-10 added: what the turn tells
+KL     sum q (log q - log p), in nats, both with 1e-10 added: the information gain
 
-After the paper's public code, with one difference: its unseen poses come from all loaded ones, those of the validation
-and test views included; here from between the training views (`Cameras.between`).
+After the paper's public code, with one difference: its unseen poses come from all loaded views, validation and test
+included; here they lie between the training views.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from edge_se_sampler.models.rendering import opacity
 TINY = 1e-10
 
 
-def shares(alpha: Tensor) -> Tensor:
-    """p of every interval, (n, s) -> (n, s); a ray without any opacity has none anywhere."""
+def ray_pdf(alpha: Tensor) -> Tensor:
+    """p of every interval, (n, s) -> (n, s); all 0 on a ray without any opacity."""
     return alpha / (alpha.sum(dim=1, keepdim=True) + TINY)
 
 
@@ -40,18 +40,18 @@ def ray_entropy(alpha: Tensor, accumulation: Tensor, threshold: float) -> Tensor
     Returns:
         (n,) in bits, 0 .. log2(s).
     """
-    p = shares(alpha)
+    p = ray_pdf(alpha)
     entropy = -(p * torch.log2(p + TINY)).sum(dim=1)
     return entropy * (accumulation.detach()[:, 0] > threshold)
 
 
-def information_gain(alpha: Tensor, near: Tensor) -> Tensor:
-    """KL from rays to the same rays turned a little; (n, s), (n, s) -> (n,) in nats, >= 0 to rounding."""
-    p, q = shares(alpha) + TINY, shares(near) + TINY
+def information_gain(alpha: Tensor, rotated_alpha: Tensor) -> Tensor:
+    """KL between rays and the same rays rotated a little; (n, s), (n, s) -> (n,) in nats, >= 0 up to rounding."""
+    p, q = ray_pdf(alpha) + TINY, ray_pdf(rotated_alpha) + TINY
     return (q * (q.log() - p.log())).sum(dim=1)
 
 
-def turn(angles: Tensor) -> Tensor:
+def rotation_matrix(angles: Tensor) -> Tensor:
     """Rotation about x, y and z, the last first: (3,) radians -> (3, 3)."""
     (cx, cy, cz), (sx, sy, sz) = angles.cos().tolist(), angles.sin().tolist()
     about_x = [[1, 0, 0], [0, cx, -sx], [0, sx, cx]]
@@ -61,8 +61,8 @@ def turn(angles: Tensor) -> Tensor:
     return x @ y @ z
 
 
-def turned(rays: RayBundle, rotation: Tensor) -> RayBundle:
-    """Rays turned about the world's origin."""
+def rotate_rays(rays: RayBundle, rotation: Tensor) -> RayBundle:
+    """The rays rotated about the world's origin by a (3, 3) matrix."""
     rotation = rotation.to(rays.origins)
     return RayBundle(rays.origins @ rotation.T, rays.directions @ rotation.T, rays.camera_indices, rays.metadata)
 
@@ -79,32 +79,32 @@ class InfoNeRFModel(NeRFModel):
         self.rotation = torch.eye(3)
 
     def begin_step(self, step: int, seed: int) -> None:
-        """As the model's; and the step's little turn, and how much its information gain counts."""
+        """As `RayModel`; draws the step's small rotation, and decays the weight of the information gain."""
         super().begin_step(step, seed)
         config = self.config
         self.gain_weight = config.gain_weight * config.gain_rate ** (step // config.gain_steps)
         if self.gain_weight:
             angles = 2 * self.uniform(1, 3)[0].cpu() - 1
-            self.rotation = turn(angles * math.radians(config.gain_degrees))
+            self.rotation = rotation_matrix(angles * math.radians(config.gain_degrees))
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(n,) NeRF's loss and the information gain; and the squared errors."""
+        """As `RayModel`; NeRF's loss plus the information gain."""
         outputs = self(rays)
         loss, error = self.loss(outputs, batch)
         return loss + self._gain(rays, outputs), error
 
     def unseen_loss(self, rays: RayBundle) -> Tensor:
-        """(n,) ray entropy and information gain."""
+        """(n,) weighted ray entropy plus information gain of rays without an image."""
         outputs = self(rays)
         entropy = ray_entropy(_alpha(outputs), outputs["accumulation_fine"], self.config.entropy_threshold)
         return self.config.entropy_weight * entropy + self._gain(rays, outputs)
 
     def _gain(self, rays: RayBundle, outputs: dict[str, Tensor]) -> Tensor:
-        """Seen and unseen rays, each a mean of its own, count half each; alone, the former count all."""
+        """Weighted information gain, (n,): the means over seen and unseen rays count half each, if there are both."""
         if not self.gain_weight:
             return torch.zeros((), device=self.device)
-        near = self(turned(rays, self.rotation))
-        return self.gain_weight / (2 if self.num_unseen_rays else 1) * information_gain(_alpha(outputs), _alpha(near))
+        gain = information_gain(_alpha(outputs), _alpha(self(rotate_rays(rays, self.rotation))))
+        return self.gain_weight / (2 if self.num_unseen_rays else 1) * gain
 
 
 def _alpha(outputs: dict[str, Tensor]) -> Tensor:

@@ -65,7 +65,7 @@ class LeanField(nn.Module):
         self.position_frequencies = config.position_frequencies or 0
         self.direction_frequencies = config.direction_frequencies or 0
         width, depth = config.width or 0, config.depth or 0
-        first = encoded_size(3, self.position_frequencies) + config.features
+        first = encoded_size(3, self.position_frequencies) + config.feature_dim
         self.layers = nn.ModuleList(linear(width if i else first, width) for i in range(depth))
         self.density = linear(width, 1)
         self.view = linear(width + encoded_size(3, self.direction_frequencies), width)
@@ -73,7 +73,7 @@ class LeanField(nn.Module):
         initialize_all(self, config.initialization, rng)
 
     def forward(
-        self, positions: Tensor, features: Tensor, directions: Tensor, first: Tensor, ray: Tensor
+        self, positions: Tensor, features: Tensor, directions: Tensor, ray_starts: Tensor, ray_indices: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Evaluate packed samples.
 
@@ -81,7 +81,7 @@ class LeanField(nn.Module):
             positions: (m, 3), -1 .. 1 along the longest edge of the box.
             features: (m, F).
             directions: (n, 3) unit.
-            first, ray: (n,) and (m,) int64, see `Samples`.
+            ray_starts, ray_indices: (n,) and (m,) int64, see `Samples`.
 
         Returns:
             raw density (m,), colour (m, 3) in [0, 1].
@@ -92,7 +92,8 @@ class LeanField(nn.Module):
         width = h.shape[1]
         encoded = positional_encoding(directions, self.direction_frequencies)
         per_ray = F.linear(encoded, self.view.weight[:, width:], self.view.bias)
-        seen = F.relu(F.linear(h, self.view.weight[:, :width]) + expand_to_samples(per_ray, first, ray), inplace=True)
+        seen = F.linear(h, self.view.weight[:, :width]) + expand_to_samples(per_ray, ray_starts, ray_indices)
+        seen = F.relu(seen, inplace=True)
         return self.density(h)[:, 0] + DENSITY_BIAS, torch.sigmoid(self.color(seen))
 
 
@@ -133,8 +134,8 @@ class LeanModel(RayModel):
         if inside.float().mean() > UNCARVED_FRACTION:
             with torch.no_grad():
                 self.fine.density.bias.sub_(math.log(max(inside.shape)) + DENSITY_BIAS)
-        if self.config.features:
-            self.features = FeatureGrid(grid, self.config.features).to(self.device, self.dtype)
+        if self.config.feature_dim:
+            self.features = FeatureGrid(grid, self.config.feature_dim).to(self.device, self.dtype)
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """The features learn faster: each sees few samples."""
@@ -186,19 +187,19 @@ class LeanModel(RayModel):
         jitter = self.uniform(len(rays), 1) if self.training else None
         samples = grid.march(rays, step, jitter, (self.config.near, self.config.far))
         positions = samples.positions
-        features = positions[:, :0] if self.features is None else self.features(positions, samples.cell)
+        features = positions[:, :0] if self.features is None else self.features(positions, samples.cell_indices)
         centered = (positions - grid.middle) / grid.reach
-        raw, color = self.fine(centered, features, rays.directions, samples.first, samples.ray)
+        raw, color = self.fine(centered, features, rays.directions, samples.ray_starts, samples.ray_indices)
         density = torch.exp(raw.clamp(max=MAX_LOG_DENSITY)) / float(grid.first_side)
         if self.training and self.config.learns_cells:
             grid.remember(samples, density)
-        rgb, accumulation = render_packed(density, color, step, samples.first, samples.ray)
-        background = self.behind(rays)
+        rgb, accumulation = render_packed(density, color, step, samples.ray_starts, samples.ray_indices)
+        background = self.get_background(rays)
         outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}
         if not self.training:
             tau = density * step
-            weight = transmittance(tau, samples.first, samples.ray) * -torch.expm1(-tau)
+            weight = transmittance(tau, samples.ray_starts, samples.ray_indices) * -torch.expm1(-tau)
             far = self.config.far * rays.metadata["directions_norm"]
-            depth = accumulate_along_rays((weight * samples.t)[:, None], samples.first)
+            depth = accumulate_along_rays((weight * samples.t)[:, None], samples.ray_starts)
             outputs["depth_fine"] = depth + (1 - accumulation) * far
         return outputs | {"background": background}

@@ -29,7 +29,7 @@ class NeRFModel(RayModel):
         rng: of the initial weights.
     """
 
-    levels = ("coarse", "fine")
+    networks = ("coarse", "fine")
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
         super().__init__(config)
@@ -79,7 +79,7 @@ class NeRFModel(RayModel):
         norm = rays.metadata["directions_norm"]
         jitter = self.uniform(count, samples) if self.training else None
         t = stratified(config.near * norm, config.far * norm, samples, jitter)
-        background = self.behind(rays)
+        background = self.get_background(rays)
         weights, rgb, _ = self._render(self.coarse, rays, t, background)
         return t, weights, rgb, background
 

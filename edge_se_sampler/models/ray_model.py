@@ -16,9 +16,9 @@ from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 
 class RayModel(nn.Module, ABC):
-    """Renders rays; every network of it is one of `levels`, "fine" the one whose colours count."""
+    """Renders rays; every network of it is one of `networks`, "fine" the one whose colours count."""
 
-    levels: tuple[str, ...] = ("fine",)
+    networks: tuple[str, ...] = ("fine",)
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -27,8 +27,8 @@ class RayModel(nn.Module, ABC):
         """Where networks are asked; None: everywhere."""
         self.random = torch.Generator()
         """Of jitter, noise and random backgrounds; the trainer seeds it at every step."""
-        self.background: Callable[[RayBundle], Tensor] | None = None
-        """n rays -> (n, 3) colours behind them; None: what the config says."""
+        self.background_fn: Callable[[RayBundle], Tensor] | None = None
+        """n rays -> (n, 3) background colours in [0, 1], in place of the config's background color."""
 
     @property
     @abstractmethod
@@ -44,8 +44,8 @@ class RayModel(nn.Module, ABC):
         """Render n rays; in training mode with jittered samples.
 
         Returns:
-            of each level rgb_LEVEL (n, 3) and accumulation_LEVEL (n, 1); depth_fine (n, 1) in world units along the
-            ray; background (n, 3) behind each ray.
+            rgb_NETWORK (n, 3) and accumulation_NETWORK (n, 1) of each network; depth_fine (n, 1), world units along the
+            ray; background (n, 3), the colours that the rays are composited on.
         """
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
@@ -92,34 +92,36 @@ class RayModel(nn.Module, ABC):
         except RuntimeError as problem:
             raise InputError("the checkpoint's weights are not this model's: another version wrote them") from problem
 
-    def squared_error(self, outputs: dict[str, Tensor], image: Tensor, level: str = "fine") -> Tensor:
+    def squared_error(self, outputs: dict[str, Tensor], image: Tensor, network: str = "fine") -> Tensor:
         """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.
 
         Args:
             image: (n, 3|4) straight-alpha pixels in [0, 1].
         """
-        return (outputs[f"rgb_{level}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
+        return (outputs[f"rgb_{network}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """(n,) what training minimises the mean of on a batch's rays, and (n,) the fine colours' squared errors."""
         return self.loss(self(rays), batch)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(n,) error of every ray, summed over the levels, a mean over channels as in NeRF's code, times its weight if
-        any; and (n,) the fine squared error alone, without a gradient."""
+        """The loss of every ray, (n,), and the fine network's squared errors, (n,), detached.
+
+        The loss is the squared error, a mean over channels as in NeRF's code, summed over the networks, and times
+        batch["weight"] (n,) if there is one.
+        """
         error = fine = self.squared_error(outputs, batch["image"], "fine")
-        for level in self.levels[:-1]:
-            error = self.squared_error(outputs, batch["image"], level) + error
+        for network in self.networks[:-1]:
+            error = self.squared_error(outputs, batch["image"], network) + error
         return (error * batch["weight"] / 3 if "weight" in batch else error / 3), fine.detach()
 
-    def behind(self, rays: RayBundle) -> Tensor:
-        """(n, 3) colours behind rays."""
-        if self.background is not None:
-            return self.background(rays)
+    def get_background(self, rays: RayBundle) -> Tensor:
+        """(n, 3) background colours of n rays, in [0, 1]."""
+        if self.background_fn is not None:
+            return self.background_fn(rays)
         if self.training and self.config.background_color == "random":
             return self.uniform(len(rays), 3)
-        shade = 0.0 if self.config.background_color == "black" else 1.0
-        return torch.full((len(rays), 3), shade, device=self.device, dtype=self.dtype)
+        return torch.full((len(rays), 3), self.config.background_level, device=self.device, dtype=self.dtype)
 
     @property
     def dtype(self) -> torch.dtype:

@@ -2,7 +2,7 @@
 
 h      side of a cell, world units
 n      rays
-m      samples, of all rays one after the other; sample i lies on ray ray[i], ascending
+m      samples, of all rays one after the other; sample i lies on ray ray_indices[i], ascending
 t      distance of a sample from its ray's origin, world units
 """
 
@@ -30,14 +30,14 @@ class Samples:
 
     t: Tensor
     """(m,)."""
-    ray: Tensor
+    ray_indices: Tensor
     """(m,) int64."""
-    first: Tensor
+    ray_starts: Tensor
     """(n,) int64: sample at which each ray begins."""
     positions: Tensor
     """(m, 3) world units."""
-    cell: Tensor
-    """(m,) int64: number of the cell that each lies in."""
+    cell_indices: Tensor
+    """(m,) int64: flat index of the cell that each lies in."""
 
 
 class OccupancyGrid(nn.Module):
@@ -184,7 +184,7 @@ class OccupancyGrid(nn.Module):
     @torch.no_grad()
     def remember(self, samples: Samples, density: Tensor) -> None:
         """Take note of the densities (m,) that training has seen, the largest of each cell."""
-        self.largest.view(-1).scatter_reduce_(0, samples.cell, density.detach(), "amax")
+        self.largest.view(-1).scatter_reduce_(0, samples.cell_indices, density.detach(), "amax")
 
     @torch.no_grad()
     def judge(self, empty: float, again: Tensor) -> Tensor:

@@ -114,7 +114,7 @@ def _missed(views: Views, shown: dict[int, Silhouette], hull: Hull) -> float:
     """Share of the foreground's pixels, or of some of them, whose ray meets no cell."""
     some = spread_pixels({i: views.images[i][..., 3] > 0 for i in shown}, LOOKED_AT)
     rays = RayGenerator(cameras_of(views))(some)
-    met = OccupancyGrid.of(hull).march(rays, hull.side / 4, None).ray
+    met = OccupancyGrid.of(hull).march(rays, hull.side / 4, None).ray_indices
     return 1 - len(met.unique()) / len(some)
 
 

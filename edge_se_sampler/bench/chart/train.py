@@ -148,7 +148,7 @@ class _Count:
 
     def __init__(self, model: Any) -> None:
         self.points = 0
-        for level in model.levels:
+        for level in model.networks:
             getattr(model, level).register_forward_hook(self._add)
 
     def _add(self, _: torch.nn.Module, asked: tuple[Any, ...], __: Any) -> None:

@@ -70,7 +70,7 @@ VARIANTS: dict[str, Variant] = {
     "economy-off": Variant("economy", "economy off", changes={f"{MODEL}.empty_space_skipping": False}),
     "no-features": Variant(
         "economy", "no features: 4 x 96 network",
-        changes={f"{MODEL}.features": 0, f"{MODEL}.depth": 4, f"{MODEL}.width": 96},
+        changes={f"{MODEL}.feature_dim": 0, f"{MODEL}.depth": 4, f"{MODEL}.width": 96},
     ),
     "two-networks": Variant(
         "economy", "coarse and fine network in the hull", "vanilla-nerf",
@@ -82,8 +82,8 @@ VARIANTS: dict[str, Variant] = {
     "width-32": Variant("size", "32 wide", changes={f"{MODEL}.width": 32}),
     "width-128": Variant("size", "128 wide", changes={f"{MODEL}.width": 128}),
     "depth-2": Variant("size", "2 layers", changes={f"{MODEL}.depth": 2}),
-    "features-4": Variant("size", "4 features", changes={f"{MODEL}.features": 4}),
-    "features-16": Variant("size", "16 features", changes={f"{MODEL}.features": 16}),
+    "features-4": Variant("size", "4 features", changes={f"{MODEL}.feature_dim": 4}),
+    "features-16": Variant("size", "16 features", changes={f"{MODEL}.feature_dim": 16}),
     "frequencies-0": Variant("size", "position as it is", changes={f"{MODEL}.position_frequencies": 0}),
     "frequencies-4": Variant("size", "4 frequencies", changes={f"{MODEL}.position_frequencies": 4}),
     "frequencies-8": Variant("size", "8 frequencies", changes={f"{MODEL}.position_frequencies": 8}),

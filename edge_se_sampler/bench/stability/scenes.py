@@ -67,7 +67,7 @@ def _rendered(split: str, focal: float, shifted: bool, count: int) -> Views:
     )
 
 
-def behind(background: Background) -> Callable[[RayBundle], Tensor] | None:
+def background_of(background: Background) -> Callable[[RayBundle], Tensor] | None:
     """What a model sees behind a ray, (n, 3); None: a random colour for each, which its config has."""
     if background == "random":
         return None

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.bench.outcome import outcome
-from edge_se_sampler.bench.stability.scenes import COLORS, behind, views
+from edge_se_sampler.bench.stability.scenes import COLORS, background_of, views
 from edge_se_sampler.bench.stability.settings import STRATEGIES, Cell, Point, points
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of, render_rays
@@ -107,7 +107,7 @@ def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Pat
     in_front_of = COLORS.get(point.background, COLORS["white"])
     datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=in_front_of)
     pipeline = Pipeline(datamanager, build_model(config, "cpu"))
-    pipeline.model.background = behind(point.background)
+    pipeline.model.background_fn = background_of(point.background)
     return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), pictures_of(test)
 
 
@@ -169,7 +169,7 @@ def measured(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict
     was_training = model.training
     model.eval()
     images = [torch.from_numpy(picture.image).reshape(-1, 4)[::stride] for picture in pictures]
-    errors, accumulations = ({level: [] for level in model.levels} for _ in range(2))
+    errors, accumulations = ({level: [] for level in model.networks} for _ in range(2))
     distances = []
     for picture, image in zip(pictures, images, strict=True):
         rays = picture.rays(model.device)[::stride]
@@ -177,14 +177,14 @@ def measured(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict
             outputs = model(rays[rows])
             away = target_colors(image[rows], outputs["background"]) - outputs["background"]
             distances.append(away.square().sum(dim=1))
-            for level in model.levels:
+            for level in model.networks:
                 errors[level].append(model.squared_error(outputs, image[rows], level))
                 accumulations[level].append(outputs[f"accumulation_{level}"][:, 0])
     model.train(was_training)
     distance, inside = torch.cat(distances), torch.cat(images)[:, 3] > 0
     return {
         level: _measured(torch.cat(errors[level]), torch.cat(accumulations[level]), distance, inside)
-        for level in model.levels
+        for level in model.networks
     }
 
 

@@ -54,10 +54,10 @@ def test_samples_are_those_of_every_ray_that_lie_in_a_cell(jittered: bool) -> No
     assert 200 < inside.sum() == len(samples.t)
     torch.testing.assert_close(samples.t, comb[torch.from_numpy(inside)])
     torch.testing.assert_close(samples.positions, positions[torch.from_numpy(inside)])
-    np.testing.assert_array_equal(samples.ray.numpy(), np.nonzero(inside)[0])
-    np.testing.assert_array_equal(samples.first.numpy(), np.cumsum(inside.sum(1)) - inside.sum(1))
-    assert bool(grid.occupied.reshape(-1)[samples.cell].all())
-    assert torch.equal(samples.cell, grid.locate(samples.positions))
+    np.testing.assert_array_equal(samples.ray_indices.numpy(), np.nonzero(inside)[0])
+    np.testing.assert_array_equal(samples.ray_starts.numpy(), np.cumsum(inside.sum(1)) - inside.sum(1))
+    assert bool(grid.occupied.reshape(-1)[samples.cell_indices].all())
+    assert torch.equal(samples.cell_indices, grid.locate(samples.positions))
 
 
 def test_no_part_of_a_ray_in_a_cell_is_left_out() -> None:
@@ -70,7 +70,7 @@ def test_no_part_of_a_ray_in_a_cell_is_left_out() -> None:
     half = torch.tensor([7, 5, 6]) * SIDE / 2
     one, other = (-half - rays.origins) * inverse, (half - rays.origins) * inverse
     length = (torch.maximum(one, other).amin(1) - torch.minimum(one, other).amax(1)).clamp(min=0)
-    number = torch.bincount(samples.ray, minlength=100)
+    number = torch.bincount(samples.ray_indices, minlength=100)
     assert bool((number > 0).any())
     assert float((number * step - length).abs().max()) <= step + 1e-9
 
@@ -79,10 +79,10 @@ def test_samples_lie_between_the_depths() -> None:
     rays = tiny_rays(300)
     grid = grid_of(np.ones((7, 5, 6), dtype=bool))
     whole, part = (grid.march(rays, 0.02, None, depths) for depths in ((0, np.inf), (3.4, 3.7)))
-    depth = part.t / rays.metadata["directions_norm"][part.ray, 0]
+    depth = part.t / rays.metadata["directions_norm"][part.ray_indices, 0]
     assert 3.4 <= float(depth.min()) < 3.43
     assert 3.67 < float(depth.max()) < 3.7
-    among = whole.t / rays.metadata["directions_norm"][whole.ray, 0]
+    among = whole.t / rays.metadata["directions_norm"][whole.ray_indices, 0]
     expected = int(((among >= 3.4) & (among < 3.7)).sum())
     assert len(part.t) == pytest.approx(expected, rel=0.05)
 
@@ -114,7 +114,7 @@ def test_cells_without_density_go_their_neighbours_stay_and_none_outside_the_hul
     samples = grid.march(tiny_rays(500), 0.1, None)
     middle = torch.tensor([[0.0, 0.0, 0.1]], dtype=torch.float64)
     number = grid.locate(middle)
-    grid.remember(samples, torch.where(samples.cell == number, 5.0, 0.5).double())
+    grid.remember(samples, torch.where(samples.cell_indices == number, 5.0, 0.5).double())
     none = torch.zeros_like(grid.possible)
     grid.judge(1.0, none)
     place = np.unravel_index(int(number), grid.possible.shape)
@@ -136,7 +136,7 @@ def test_the_largest_density_of_a_cell_counts() -> None:
     for part in (density, density / 2):
         grid.remember(samples, part)
     expected = np.zeros(grid.possible.numel())
-    np.maximum.at(expected, samples.cell.numpy(), density.numpy())
+    np.maximum.at(expected, samples.cell_indices.numpy(), density.numpy())
     np.testing.assert_array_equal(grid.largest.reshape(-1).numpy(), expected)
 
 

@@ -25,7 +25,7 @@ from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import InfoNeRFModelConfig
-from edge_se_sampler.models.infonerf import InfoNeRFModel, information_gain, ray_entropy, turn, turned
+from edge_se_sampler.models.infonerf import InfoNeRFModel, information_gain, ray_entropy, rotate_rays, rotation_matrix
 from edge_se_sampler.models.rendering import opacity
 
 HIT = torch.ones(1, 1).double()
@@ -157,11 +157,11 @@ def test_one_training_view_is_its_own_neighbour() -> None:
 def test_turning_is_about_x_y_and_z_and_moves_no_point_of_the_world() -> None:
     angles = torch.tensor([0.1, -0.2, 0.3]).double()
     about = [rotation(axis, math.degrees(a)) for axis, a in zip(np.eye(3).tolist(), angles.tolist(), strict=True)]
-    torch.testing.assert_close(turn(angles), about[0] @ about[1] @ about[2])
+    torch.testing.assert_close(rotation_matrix(angles), about[0] @ about[1] @ about[2])
     rays = tiny_rays(5)
-    away = turned(rays, turn(angles))
+    away = rotate_rays(rays, rotation_matrix(angles))
     at, there = (bundle.origins + 2 * bundle.directions for bundle in (rays, away))
-    torch.testing.assert_close(there, at @ turn(angles).T)
+    torch.testing.assert_close(there, at @ rotation_matrix(angles).T)
     torch.testing.assert_close(away.directions.norm(dim=1), torch.ones(5).double())
 
 
