@@ -146,7 +146,7 @@ def test_an_output_folder_that_cannot_be_written(scene: Path, tmp_path: Path, ed
     ("command", "flag", "path"),
     [
         (("demo",), "--output-dir", "file"),
-        (("bench", "quality"), "--output-dir", "file/below"),
+        (("bench", "chart"), "--output-dir", "file/below"),
         (("bench", "samplers"), "--output-path", "file/result.json"),
     ],
 )

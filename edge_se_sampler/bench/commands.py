@@ -10,7 +10,6 @@ import tyro
 
 from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart, BenchStep
 from edge_se_sampler.errors import InputError, check_known
-from edge_se_sampler.methods import registered_methods
 
 
 @dataclass(frozen=True)
@@ -77,32 +76,6 @@ class BenchScoring:
         print(table_of(result))
         if self.output_path is not None:
             write_json(self.output_path, result)
-
-
-@dataclass(frozen=True)
-class BenchQuality:
-    """Train a method on a synthetic scene for some minutes; leave result.json and curve.png."""
-
-    output_dir: Path
-    """Where the result goes."""
-    workplace: Path = Path("bench")
-    """Where the scene and the run are kept."""
-    method: str = "edge-se-nerf"
-    """One of edge-se methods."""
-    scene: str = "bricks"
-    """One of edge-se scenes."""
-    seconds: float = 180
-    """Of training at most."""
-    seed: int = 0
-    """Of weights, pixels and jitter."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.quality import bench_quality
-
-        if self.method not in registered_methods():
-            raise InputError(f"--method {self.method!r} is not registered; see edge-se methods")
-        result = bench_quality(self.output_dir, self.workplace, self.method, self.scene, self.seconds, self.seed)
-        print(f"{result['results']['psnr']:.2f} dB after {result['seconds']:.0f} s; see {self.output_dir}")
 
 
 @dataclass(frozen=True)
@@ -347,10 +320,27 @@ class BenchSchedule(_Parallel):
         print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
 
 
+@dataclass(frozen=True)
+class BenchReport:
+    """Write the README.md and pictures of an experiment's folder again; trains nothing."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder with the result of another bench command."""
+    readme: Path | None = None
+    """A text whose tables between `<!-- table: NAME -->` and `<!-- end -->` are filled in too."""
+    workplace: Path = Path("bench")
+    """Where the experiment left renderings; pictures made of them are drawn again only if they are there."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.report import write_report
+
+        write_report(self.folder, self.readme, self.workplace)
+        print(f"wrote {self.folder / 'README.md'}")
+
+
 BENCHES: dict[str, type] = {
     "samplers": BenchSamplers,
     "scoring": BenchScoring,
-    "quality": BenchQuality,
     "nerfstudio": BenchNerfstudio,
     "paper": BenchPaper,
     "stability": BenchStability,
@@ -358,4 +348,5 @@ BENCHES: dict[str, type] = {
     "chart": BenchChart,
     "beside": BenchBeside,
     "step": BenchStep,
+    "report": BenchReport,
 }
