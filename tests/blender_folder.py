@@ -11,6 +11,8 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
+from edge_se_sampler.data.views import Views
+
 WIDTH, HEIGHT = 6, 4
 ANGLE = 0.6911112070083618  # NeRF-synthetic's
 
@@ -27,6 +29,16 @@ def pose(seed: int) -> list[list[float]]:
     matrix[:3, :3] = turn * np.sign(np.linalg.det(turn))
     matrix[:3, 3] = rng.normal(size=3)
     return matrix.tolist()
+
+
+def focal_lengths(views: Views) -> np.ndarray:
+    """(n, 2) fx, fy."""
+    return np.hstack((views.cameras.fx, views.cameras.fy))
+
+
+def principal_points(views: Views) -> np.ndarray:
+    """(n, 2) cx, cy."""
+    return np.hstack((views.cameras.cx, views.cameras.cy))
 
 
 def write_scene(folder: Path, n: int = 3, split: str = "train") -> dict[str, Any]:

@@ -307,8 +307,8 @@ def test_real_data_and_its_counterparts(tmp_path: Path) -> None:
     assert data_of(todo[0]) == tmp_path / "real" / "lego"
     shifted, padded = (read_blender(data_of(cell), "train") for cell in todo[1:])
     assert shifted.images[0].shape == padded.images[0].shape == (26, 28, 4)
-    assert shifted.principal[0].tolist() == [18, 16]
-    assert padded.principal[0].tolist() == [14, 13]
+    assert [float(c[0]) for c in (shifted.cameras.cx, shifted.cameras.cy)] == [18, 16]
+    assert [float(c[0]) for c in (padded.cameras.cx, padded.cameras.cy)] == [14, 13]
 
 
 @pytest.mark.parametrize(

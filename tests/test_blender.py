@@ -11,7 +11,20 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from blender_folder import ANGLE, HEIGHT, WIDTH, chunk, pixels, png, pose, write_json, write_scene
+import torch
+from blender_folder import (
+    ANGLE,
+    HEIGHT,
+    WIDTH,
+    chunk,
+    focal_lengths,
+    pixels,
+    png,
+    pose,
+    principal_points,
+    write_json,
+    write_scene,
+)
 
 from edge_se_sampler.data.blender import has_split, read_blender
 from edge_se_sampler.errors import InputError
@@ -29,23 +42,23 @@ def test_pixels_names_and_poses_are_those_on_disk(tmp_path: Path, doc: dict[str,
     for i, image in enumerate(views.images):
         assert image.dtype == np.uint8
         np.testing.assert_array_equal(image, pixels(i))  # alpha straight: colours under alpha 0 too
-    assert views.camera_to_worlds.dtype == np.float64
+    assert views.cameras.camera_to_worlds.dtype == torch.float64
     expected = [frame["transform_matrix"][:3] for frame in doc["frames"]]
-    np.testing.assert_array_equal(views.camera_to_worlds, expected)  # every bit of the doubles
+    np.testing.assert_array_equal(views.cameras.camera_to_worlds, expected)  # every bit of the doubles
 
 
 def test_camera_from_the_angle(tmp_path: Path, doc: dict[str, Any]) -> None:
     views = read_blender(tmp_path, "train")
-    assert views.focal.shape == views.principal.shape == (3, 2)
-    assert views.focal.dtype == views.principal.dtype == np.float64
-    np.testing.assert_allclose(views.focal, 0.5 * WIDTH / math.tan(0.5 * ANGLE), rtol=1e-15)
-    np.testing.assert_array_equal(views.principal, [[WIDTH / 2, HEIGHT / 2]] * 3)
+    assert focal_lengths(views).shape == principal_points(views).shape == (3, 2)
+    assert focal_lengths(views).dtype == principal_points(views).dtype == np.float64
+    np.testing.assert_allclose(focal_lengths(views), 0.5 * WIDTH / math.tan(0.5 * ANGLE), rtol=1e-15)
+    np.testing.assert_array_equal(principal_points(views), [[WIDTH / 2, HEIGHT / 2]] * 3)
 
 
 def test_the_known_focal_of_nerf_synthetic(tmp_path: Path, doc: dict[str, Any]) -> None:
     for i in range(3):
         iio.imwrite(tmp_path / f"train/r_{i}.png", np.zeros((2, 800, 3), np.uint8))
-    np.testing.assert_allclose(read_blender(tmp_path, "train").focal, 1111.1110311937682, rtol=1e-12)
+    np.testing.assert_allclose(focal_lengths(read_blender(tmp_path, "train")), 1111.1110311937682, rtol=1e-12)
 
 
 def test_lengths_in_pixels_override_the_angle_and_a_frame_its_file(tmp_path: Path, doc: dict[str, Any]) -> None:
@@ -53,8 +66,8 @@ def test_lengths_in_pixels_override_the_angle_and_a_frame_its_file(tmp_path: Pat
     doc["frames"][1] |= {"fl_x": 20.25, "cy": 1.75}
     write_json(tmp_path, doc)
     views = read_blender(tmp_path, "train")
-    np.testing.assert_array_equal(views.focal, [[10, 11.5], [20.25, 11.5], [10, 11.5]])
-    np.testing.assert_array_equal(views.principal, [[2.5, -1], [2.5, 1.75], [2.5, -1]])
+    np.testing.assert_array_equal(focal_lengths(views), [[10, 11.5], [20.25, 11.5], [10, 11.5]])
+    np.testing.assert_array_equal(principal_points(views), [[2.5, -1], [2.5, 1.75], [2.5, -1]])
 
 
 def test_the_angle_may_be_missing_beside_fl_x_and_pixels_are_square(tmp_path: Path, doc: dict[str, Any]) -> None:
@@ -62,7 +75,7 @@ def test_the_angle_may_be_missing_beside_fl_x_and_pixels_are_square(tmp_path: Pa
     for i, frame in enumerate(doc["frames"]):
         frame["fl_x"] = i + 1
     write_json(tmp_path, doc)
-    np.testing.assert_array_equal(read_blender(tmp_path, "train").focal, [[1, 1], [2, 2], [3, 3]])
+    np.testing.assert_array_equal(focal_lengths(read_blender(tmp_path, "train")), [[1, 1], [2, 2], [3, 3]])
 
 
 def test_sizes_may_differ_where_frames_state_them(tmp_path: Path, doc: dict[str, Any]) -> None:
@@ -72,8 +85,8 @@ def test_sizes_may_differ_where_frames_state_them(tmp_path: Path, doc: dict[str,
     write_json(tmp_path, doc)
     views = read_blender(tmp_path, "train")
     np.testing.assert_array_equal(views.images[1], pixels(7, 3, 5, 3))
-    np.testing.assert_allclose(views.focal[:, 0] / [WIDTH, 3, WIDTH], 0.5 / math.tan(0.5 * ANGLE))
-    np.testing.assert_array_equal(views.principal[1], [1.5, 2.5])
+    np.testing.assert_allclose(focal_lengths(views)[:, 0] / [WIDTH, 3, WIDTH], 0.5 / math.tan(0.5 * ANGLE))
+    np.testing.assert_array_equal(principal_points(views)[1], [1.5, 2.5])
 
 
 def test_masks_are_true_where_not_black_and_whole_where_missing(tmp_path: Path, doc: dict[str, Any]) -> None:
@@ -160,7 +173,7 @@ def test_a_hundred_views_keep_the_order_of_the_json(tmp_path: Path) -> None:
     write_json(tmp_path, doc)
     views = read_blender(tmp_path, "train")
     assert views.names == tuple(f"./train/r_{i}" for i in order)
-    for i, image, matrix in zip(order, views.images, views.camera_to_worlds, strict=True):
+    for i, image, matrix in zip(order, views.images, views.cameras.camera_to_worlds, strict=True):
         np.testing.assert_array_equal(image, pixels(i))
         np.testing.assert_array_equal(matrix, pose(i)[:3])
 
@@ -193,7 +206,7 @@ def test_poses_as_rounded_in_files_are_kept_as_written(tmp_path: Path, doc: dict
         frame["transform_matrix"] = np.round(frame["transform_matrix"], 4).tolist()
     write_json(tmp_path, doc)
     expected = [frame["transform_matrix"][:3] for frame in doc["frames"]]
-    np.testing.assert_array_equal(read_blender(tmp_path, "train").camera_to_worlds, expected)
+    np.testing.assert_array_equal(read_blender(tmp_path, "train").cameras.camera_to_worlds, expected)
 
 
 def test_links_that_stay_inside_and_a_folder_behind_a_link(tmp_path: Path) -> None:

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
-from tiny import tiny_views
 
-from edge_se_sampler.data.cameras import RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.camera_path import spiral
 
-VIEWS = tiny_views(height=8, width=6)
-FOCAL = np.array([[7.0, 8.0], [9.0, 10.0], [11.0, 12.0]])
-LIKE = cameras_of(
-    replace(VIEWS, focal=FOCAL, principal=FOCAL / 2, images=(VIEWS.images[0], *tiny_views(2, 4, 5).images))
-)
-LIKE.camera_to_worlds[0, :, 3] = torch.tensor([0.0, 3.0, 4.0])  # 5, 4 and 4 units away
+POSES = np.stack([np.eye(4)] * 3)
+POSES[:, :3, 3] = [[0, 3, 4], [0, 0, 4], [0, 0, 4]]  # 5, 4 and 4 units away from the origin
+LIKE = Cameras.of(POSES, fx=[7, 9, 11], fy=[8, 10, 12], cx=[3, 4, 5], cy=[4, 5, 6], width=[6, 5, 5], height=[8, 4, 4])
 
 
 def test_poses_are_rigid_and_upright() -> None:
@@ -48,9 +41,9 @@ def test_it_is_one_even_turn_between_15_and_45_degrees() -> None:
     np.testing.assert_allclose((elevation.min(), elevation.max()), (15, 45), atol=0.01)
 
 
-def test_the_lens_and_size_are_the_first_cameras() -> None:
+def test_the_intrinsics_and_size_are_the_first_cameras() -> None:
     cameras = spiral(LIKE, 5)
     assert len(cameras) == 5
     for key in ("fx", "fy", "cx", "cy", "width", "height"):
         assert getattr(cameras, key).tolist() == [getattr(LIKE, key)[0].tolist()] * 5
-    assert len(RayGenerator(cameras).image(4)) == 8 * 6
+    assert len(cameras.image_rays(4)) == 8 * 6

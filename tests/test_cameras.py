@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.cameras import Cameras, RayBundle, RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.visibility import NOTHING, nearest_hits
@@ -56,7 +55,7 @@ def test_what_lies_on_a_pixels_ray_projects_to_its_centre() -> None:
     for camera, (rows, columns) in enumerate(SIZES):
         for row in range(rows):
             for column in range(columns):
-                rays = RayGenerator(cameras)(torch.tensor([[camera, row, column]]))
+                rays = cameras.pixel_rays(torch.tensor([[camera, row, column]]))
                 for distance in (0.5, 3.0, 40.0):
                     seen = project(cameras, camera, along(rays, distance))[0]
                     np.testing.assert_allclose(seen[:2], (row + 0.5, column + 0.5), atol=1e-9)
@@ -79,7 +78,7 @@ def test_directions_are_of_unit_length_and_their_norm_tells_depth() -> None:
     """A sample at distance depth * directions_norm lies at that depth: near and far are planes, not spheres."""
     cameras = some_cameras()
     for camera in range(3):
-        rays = RayGenerator(cameras).image(camera)
+        rays = cameras.image_rays(camera)
         np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1, rtol=1e-12)
         norm = rays.metadata["directions_norm"]
         assert norm.shape == (len(rays), 1)
@@ -89,11 +88,45 @@ def test_directions_are_of_unit_length_and_their_norm_tells_depth() -> None:
             np.testing.assert_allclose(project(cameras, camera, points)[:, 2], depth, rtol=1e-9)
 
 
+def test_projection_is_the_inverse_of_rays() -> None:
+    cameras, rng = some_cameras(), np.random.default_rng(1)
+    for camera in range(3):
+        points = rng.normal(size=(50, 3))
+        coords, depth = cameras.project(camera, torch.from_numpy(points))
+        np.testing.assert_allclose(torch.cat((coords, depth[:, None]), dim=1), project(cameras, camera, points))
+        ahead = points[depth > 0]
+        rays = cameras.generate_rays(torch.full((len(ahead), 1), camera), coords[depth > 0])
+        along_ray = depth[depth > 0, None] * rays.metadata["directions_norm"]
+        np.testing.assert_allclose(rays.origins + along_ray * rays.directions, ahead, atol=1e-9)
+
+
+def test_indexing_keeps_every_field_and_the_order() -> None:
+    cameras = some_cameras()
+    for chosen in (cameras[[2, 0]], cameras[[2, 1, 0]][::2]):
+        assert len(chosen) == 2
+        for key, values in vars(cameras).items():
+            torch.testing.assert_close(getattr(chosen, key), values[[2, 0]])
+
+
+def test_cameras_of_matrices_share_plain_numbers() -> None:
+    poses = np.random.default_rng(0).normal(size=(3, 4, 4))
+    cameras = Cameras.of(poses, fx=[10, 12, 14], fy=11, cx=2.5, cy=(1, 2, 3), width=6, height=[4, 5, 6])
+    np.testing.assert_array_equal(cameras.camera_to_worlds, poses[:, :3])
+    assert (cameras.fx.tolist(), cameras.fy.tolist()) == ([[10], [12], [14]], [[11]] * 3)
+    assert (cameras.cx.tolist(), cameras.cy.tolist()) == ([[2.5]] * 3, [[1], [2], [3]])
+    assert (cameras.width.tolist(), cameras.height.tolist()) == ([[6]] * 3, [[4], [5], [6]])
+    assert (cameras.fx.dtype, cameras.width.dtype) == (torch.float64, torch.int64)
+
+
+def test_conversion_leaves_sizes_whole() -> None:
+    cameras = some_cameras().to("cpu", torch.float32)
+    assert {value.dtype for value in vars(cameras).values()} == {torch.float32, torch.int64}
+
+
 def test_an_image_is_row_major() -> None:
     cameras = some_cameras()
-    generator = RayGenerator(cameras)
     for camera, (rows, columns) in enumerate(SIZES):
-        rays = generator.image(camera)
+        rays = cameras.image_rays(camera)
         assert len(rays) == rows * columns
         assert rays.camera_indices.tolist() == [[camera]] * len(rays)
         seen = project(cameras, camera, along(rays, 2.0))[:, :2].reshape(rows, columns, 2)
@@ -102,10 +135,10 @@ def test_an_image_is_row_major() -> None:
 
 
 def test_a_slice_of_rays_is_those_rays() -> None:
-    generator = RayGenerator(some_cameras())
+    cameras = some_cameras()
     indices = torch.tensor([[2, 1, 7], [0, 4, 0], [1, 0, 5], [0, 0, 0]])
-    every = generator(indices)
-    part, alone = every[1:3], generator(indices[1:3])
+    every = cameras.pixel_rays(indices)
+    part, alone = every[1:3], cameras.pixel_rays(indices[1:3])
     assert len(part) == 2
     assert part.camera_indices[:, 0].tolist() == [0, 1]
     for one, other in ((part.origins, alone.origins), (part.directions, alone.directions)):
@@ -128,13 +161,12 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_a_shifted_scene_has_the_rays_of_the_centred_one(folders: dict[str, Path]) -> None:
     """Pixels pasted (12, 4) right and up of the corner: same colours, same rays, so nothing but the place differs."""
     centred, shifted = (read_blender(folders[name], "train") for name in ("centered", "shifted"))
-    generators = [RayGenerator(cameras_of(views)) for views in (centred, shifted)]
     top, left = 20 - 12 - 4, 20 - 12 + 8
     for view in range(3):
         pasted = shifted.images[view][top : top + 24, left : left + 24]
         np.testing.assert_array_equal(pasted, centred.images[view])
-        small = generators[0].image(view)
-        large = generators[1].image(view)
+        small = centred.cameras.image_rays(view)
+        large = shifted.cameras.image_rays(view)
         for name in ("origins", "directions"):
             inside = getattr(large, name).reshape(40, 40, 3)[top : top + 24, left : left + 24]
             torch.testing.assert_close(inside, getattr(small, name).reshape(24, 24, 3), rtol=0, atol=2e-6)
@@ -146,7 +178,7 @@ def test_rays_meet_the_scene_where_its_pictures_show_it(folders: dict[str, Path]
     views = read_blender(folders[placement], "train")
     scene = synthetic_scene("bricks")
     for view in range(3):
-        rays = RayGenerator(cameras_of(views)).image(view)
+        rays = views.cameras.image_rays(view)
         _, met = nearest_hits(scene, rays.origins.T.double().numpy(), rays.directions.T.double().numpy())
         alpha = views.images[view][..., 3].ravel()
         assert (alpha == 255).sum() > 50

@@ -11,9 +11,8 @@ import pytest
 import torch
 from tiny import tiny_model, tiny_views
 
-from edge_se_sampler.data.cameras import RayGenerator
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.data.datamanager import VanillaDataManager, cameras_of, image_batch, unit_interval
+from edge_se_sampler.data.datamanager import VanillaDataManager, image_batch, unit_interval
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import PixelSampler, PixelSamplerConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
@@ -84,17 +83,6 @@ def test_eight_bits_become_the_unit_interval_and_floats_stay() -> None:
     assert unit_interval(floats) is floats
 
 
-def test_cameras_are_the_views() -> None:
-    poses = np.random.default_rng(0).normal(size=(3, 3, 4))
-    lens = np.array([[10.0, 11], [12, 13], [14, 15]])
-    images = tuple(image[: 8 - i, : 6 - i] for i, image in enumerate(VIEWS.images))
-    cameras = cameras_of(replace(VIEWS, images=images, camera_to_worlds=poses, focal=lens, principal=-lens))
-    np.testing.assert_allclose(cameras.camera_to_worlds, poses, rtol=1e-6)
-    assert (cameras.fx[:, 0].tolist(), cameras.fy[:, 0].tolist()) == ([10, 12, 14], [11, 13, 15])
-    assert (cameras.cx[:, 0].tolist(), cameras.cy[:, 0].tolist()) == ([-10, -12, -14], [-11, -13, -15])
-    assert (cameras.height[:, 0].tolist(), cameras.width[:, 0].tolist()) == ([8, 7, 6], [6, 5, 4])
-
-
 # --- next_train ---
 
 
@@ -108,7 +96,7 @@ def test_rays_and_pixels_of_a_step_belong_together(step: int, images_per_step: A
     assert len(rays) == len(batch["indices"]) == len(batch["image"]) == 50
     for i, (view, row, column) in enumerate(batch["indices"].tolist()):
         np.testing.assert_allclose(batch["image"][i], VIEWS.images[view][row, column] / 255, rtol=1e-6)
-        expected = RayGenerator(cameras_of(VIEWS)).image(view)
+        expected = VIEWS.cameras.to(dtype=torch.float32).image_rays(view)
         torch.testing.assert_close(rays.directions[i], expected.directions[row * 6 + column])
         assert rays.camera_indices[i].tolist() == [view]
     assert len(set(batch["indices"][:, 0].tolist())) == (1 if images_per_step == "one" else 3)

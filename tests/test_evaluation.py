@@ -13,9 +13,7 @@ import torch
 from tiny import tiny_config, tiny_views, with_constant_density
 from torch import Tensor
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.evaluation import (
     Picture,
     evaluate,
@@ -103,7 +101,7 @@ def test_a_view_is_rendered_pixel_by_pixel_and_clipped() -> None:
     rendered, decibel = render_view(model, picture)
     assert rendered.shape == (5, 7, 3)
     for row, column in ((0, 0), (0, 6), (4, 0), (2, 3)):
-        ray = RayGenerator(cameras_of(views))(torch.tensor([[1, row, column]]))
+        ray = views.cameras.to(dtype=torch.float32).pixel_rays(torch.tensor([[1, row, column]]))
         with torch.no_grad():
             expected = model(ray)["rgb_fine"][0]
         np.testing.assert_allclose(rendered[row, column], expected, atol=1e-6)

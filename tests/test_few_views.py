@@ -31,8 +31,8 @@ def test_a_subset_keeps_everything_of_its_views() -> None:
     assert few.masks is not None
     assert (few.masks[0].all(), few.masks[1].any()) == (True, False)
     np.testing.assert_array_equal(few.images[0], views.images[3])
-    for key in ("camera_to_worlds", "focal", "principal"):
-        np.testing.assert_array_equal(getattr(few, key), getattr(views, key)[[3, 1]])
+    for key, values in vars(views.cameras).items():
+        np.testing.assert_array_equal(getattr(few.cameras, key), values[[3, 1]])
 
 
 def test_the_data_of_a_run_is_only_what_was_chosen(scene: Path) -> None:

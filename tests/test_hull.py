@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.synthetic.cameras import poses
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.occupancy import hull as hull_module
@@ -62,9 +61,16 @@ def views_of(points: np.ndarray, size: int = 100, count: int = VIEWS, focal: flo
         image[row[inside], column[inside]] = 255
         images.append(image)
     return Views(
-        tuple(map(str, range(count))), tuple(images), None, np.stack([pose[:3] for pose in matrices]),
-        np.full((count, 2), focal * size), np.full((count, 2), size / 2),
-    )  # fmt: skip
+        tuple(map(str, range(count))),
+        tuple(images),
+        None,
+        Cameras.of(matrices, fx=focal * size, fy=focal * size, cx=size / 2, cy=size / 2, width=size, height=size),
+    )
+
+
+def with_cameras(views: Views, **changes: torch.Tensor) -> Views:
+    """The views with other values of their cameras' fields."""
+    return replace(views, cameras=replace(views.cameras, **changes))
 
 
 def with_masks(views: Views, change: Callable[[int, np.ndarray], np.ndarray]) -> Views:
@@ -86,13 +92,13 @@ def hull_of(views: Views, voxel_size_px: float = 1.6) -> Hull:
 
 def missed(views: Views, hull: Hull) -> int:
     """Foreground pixels whose ray meets no cell of the hull."""
-    grid, generator = OccupancyGrid.of(hull), RayGenerator(cameras_of(views))
+    grid, cameras = OccupancyGrid.of(hull), views.cameras.to(dtype=torch.float32)
     pixels = np.concatenate(
         [np.insert(np.argwhere(image[..., 3] > 0), 0, i, axis=1) for i, image in enumerate(views.images)]
     )
     count = 0
     for chunk in torch.from_numpy(pixels).split(4096):
-        samples = grid.march(generator(chunk), hull.side / 8, None)
+        samples = grid.march(cameras.pixel_rays(chunk), hull.side / 8, None)
         count += int((torch.bincount(samples.ray_indices, minlength=len(chunk)) == 0).sum())
     return count
 
@@ -102,11 +108,12 @@ def missed(views: Views, hull: Hull) -> int:
 
 def test_the_box_is_where_the_cameras_look_and_as_large_as_their_depths() -> None:
     views = views_of(rods())
-    moved = replace(
-        views, camera_to_worlds=views.camera_to_worlds + np.array([[0, 0, 0, 5], [0, 0, 0, -2], [0, 0, 0, 1]])
+    moved = with_cameras(
+        views,
+        camera_to_worlds=views.cameras.camera_to_worlds + torch.tensor([[0, 0, 0, 5], [0, 0, 0, -2], [0, 0, 0, 1]]),
     )
     box = box_of(moved, 2.5, 6)
-    distance = np.linalg.norm(views.camera_to_worlds[:, :, 3], axis=1)
+    distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3], axis=1)
     np.testing.assert_allclose(box.middle, (5, -2, 1), atol=1e-9)
     assert box.half == pytest.approx(max((6 - distance).max(), (distance - 2.5).max()))
     assert footprint(moved, box) == pytest.approx(np.median(distance) / 137)
@@ -121,7 +128,7 @@ def test_cameras_side_by_side_look_at_what_is_before_them(apart: float) -> None:
     right = np.cross(ahead, (0, 1, 0))
     position = np.stack((np.linspace(-0.5, 0.5, 5), np.zeros(5), np.full(5, 3.0)), axis=1)
     poses = np.stack((right, np.broadcast_to((0.0, 1.0, 0.0), right.shape), -ahead, position), axis=2)
-    side = replace(views, camera_to_worlds=poses)
+    side = with_cameras(views, camera_to_worlds=torch.from_numpy(poses))
     box = box_of(side, 2, 6)
     np.testing.assert_allclose(box.middle, (0, 0, -1), atol=0.01)  # 4 ahead of them
     assert box.half == pytest.approx(2, abs=0.1)
@@ -132,13 +139,13 @@ def test_a_rectangle_holds_all_of_its_cell() -> None:
     views, rng = views_of(rods()), np.random.default_rng(1)
     centers, side = rng.uniform(-1.5, 1.5, (500, 3)), 0.4
     for number in range(VIEWS):
-        low, high, where = projected(views, number, centers, side)
+        low, high, where = projected(views.cameras, number, centers, side)
         assert (where == IN_FRONT).all()
-        pose = views.camera_to_worlds[number]
+        pose = views.cameras.camera_to_worlds[number].numpy()
         worst = []
         for corner in np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3):
             x, y, z = ((centers + corner * side / 2 - pose[:, 3]) @ pose[:, :3]).T
-            pixel = np.stack((-x / z, y / z), axis=1) * views.focal[number] + views.principal[number]
+            pixel = np.stack((-x / z, y / z), axis=1) * 137 + 50
             assert (pixel >= low.T - 1e-4).all()
             assert (pixel <= high.T + 1e-4).all()
             worst.append(np.abs(pixel.T - (low + high) / 2) / (high - low))
@@ -147,9 +154,9 @@ def test_a_rectangle_holds_all_of_its_cell() -> None:
 
 def test_a_cell_around_a_camera_is_not_judged_by_it() -> None:
     views = views_of(rods())
-    pose = views.camera_to_worlds[0]
+    pose = views.cameras.camera_to_worlds[0].numpy()
     centers = pose[:, 3] - np.array([[0.0], [1.0], [-1.0]]) * pose[:, 2]
-    assert projected(views, 0, centers, 0.5)[2].tolist() == [STRADDLING, IN_FRONT, BEHIND]
+    assert projected(views.cameras, 0, centers, 0.5)[2].tolist() == [STRADDLING, IN_FRONT, BEHIND]
 
 
 # -- nothing that is seen goes
@@ -226,11 +233,7 @@ def test_cells_that_are_known_to_be_empty_may_be_dropped(fewer: float, monkeypat
 def test_hundreds_of_views_carve_as_a_few_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as a byte cannot count."""
     views = views_of(rods(), 40, 4)
-    often = replace(
-        views, names=views.names * 64, images=views.images * 64,
-        camera_to_worlds=np.tile(views.camera_to_worlds, (64, 1, 1)), focal=np.tile(views.focal, (64, 1)),
-        principal=np.tile(views.principal, (64, 1)),
-    )  # fmt: skip
+    often = views.subset([*range(4)] * 64)
     monkeypatch.setattr(hull_module, "FEWER", 0.0)
     monkeypatch.setattr(hull_module, "MIN_EMPTY_VIEWS", 1)
     np.testing.assert_array_equal(hull_of(often).cells, hull_of(views).cells)
@@ -255,7 +258,7 @@ def test_what_an_image_cuts_off_is_kept() -> None:
     kept = OccupancyGrid.of(hull).contains(torch.from_numpy(points).float()).numpy()
     seen = np.zeros(len(points), dtype=bool)
     for number in range(VIEWS):
-        low, high, _ = projected(views, number, points, 1e-6)
+        low, high, _ = projected(views.cameras, number, points, 1e-6)
         seen |= ((low > 0) & (high < 100)).all(axis=0)
     assert 0.5 < seen.mean() < 1
     assert kept[seen].all()
@@ -284,7 +287,7 @@ def test_without_a_background_all_that_views_see_is_kept(opaque: bool) -> None:
 def test_a_cell_behind_a_camera_is_not_seen_by_it() -> None:
     """One camera at the side of a box far larger than its depths: half of the cells lie behind it."""
     views = views_of(rods(), count=1)
-    pose = views.camera_to_worlds[0]
+    pose = views.cameras.camera_to_worlds[0].numpy()
     hull = carve(views, {}, Box(pose[:, 3], 1.0), 0.1)
     assert hull is not None
     centers = hull.corner + (np.argwhere(hull.cells) + 0.5) * hull.side
@@ -307,7 +310,7 @@ def test_a_sparse_scene_has_no_grid_without_bounds(monkeypatch: pytest.MonkeyPat
 
 def test_cameras_that_see_nothing_are_refused_in_one_line() -> None:
     views = views_of(rods())
-    aside = replace(views, principal=views.principal + 4000)
+    aside = with_cameras(views, cx=views.cameras.cx + 4000, cy=views.cameras.cy + 4000)
     with pytest.raises(InputError, match=r"no training view sees anything.*principal points"):
         analyze_scene(aside, LeanModelConfig())
 
@@ -371,10 +374,10 @@ def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int,
 def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
     views = views_of(rods())
     hull = hull_of(views)
-    grid, generator = OccupancyGrid.of(hull), RayGenerator(cameras_of(views))
+    grid, cameras = OccupancyGrid.of(hull), views.cameras.to(dtype=torch.float32)
     dead = 0
     for number, live in enumerate(live_pixels(views, hull)):
-        rays = generator.image(number)
+        rays = cameras.image_rays(number)
         meets = torch.bincount(grid.march(rays, hull.side / 4, None).ray_indices, minlength=len(rays)).numpy() > 0
         assert not (meets & ~live.reshape(-1)).any()
         dead += (live.reshape(-1) & ~meets).mean()
@@ -384,7 +387,7 @@ def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
 def test_what_lies_behind_or_beside_an_image_makes_no_pixel_live() -> None:
     """A cell just before the camera's plane, far to the side, projects to a rectangle of thousands of pixels."""
     views = views_of(rods())
-    pose = views.camera_to_worlds[0]
+    pose = views.cameras.camera_to_worlds[0].numpy()
     aside = pose[:, 3] + 30 * pose[:, 0] - 0.2 * pose[:, 2]
     behind = pose[:, 3] + pose[:, 2]
     for center in (aside, behind):

@@ -121,7 +121,7 @@ def cameras(*rotations: Tensor, distance: float = 4.0) -> Cameras:
 def test_between_turns_evenly_and_keeps_looking_at_the_same_point(degrees: float, share: float) -> None:
     start = rotation([1, 2, -1], 70)
     both = cameras(start, start @ rotation([0.3, -1, 0.5], degrees))
-    between = both.between(0, 1, share)
+    between = both.interpolate(0, 1, share)
     expected = start @ rotation([0.3, -1, 0.5], share * degrees)
     torch.testing.assert_close(between.camera_to_worlds[0, :, :3], expected, atol=1e-6, rtol=0)
     torch.testing.assert_close(between.camera_to_worlds[0, :, 3], 4 * expected[:, 2], atol=1e-5, rtol=0)
@@ -129,14 +129,15 @@ def test_between_turns_evenly_and_keeps_looking_at_the_same_point(degrees: float
 
 
 def test_half_a_turn_is_a_rotation_on_the_way() -> None:
-    half = cameras(torch.eye(3).double(), rotation([0, 0, 1], 180)).between(0, 1, 0.5).camera_to_worlds[0, :, :3]
+    half = cameras(torch.eye(3).double(), rotation([0, 0, 1], 180)).interpolate(0, 1, 0.5).camera_to_worlds[0, :, :3]
     torch.testing.assert_close(half @ half, rotation([0, 0, 1], 180), atol=1e-9, rtol=0)
 
 
 def test_unseen_rays_are_uniform_in_images_between_training_views() -> None:
-    views = replace(tiny_views(3, 8, 6), camera_to_worlds=np.stack(poses("train", 3))[:, :3])
+    cameras = Cameras.of(poses("train", 3), fx=7, fy=8, cx=3, cy=4, width=6, height=8)
+    views = replace(tiny_views(3, 8, 6), cameras=cameras)
     manager = VanillaDataManagerConfig(train_num_rays_per_batch=5).setup(views=views)
-    origins = manager.train_ray_generator.cameras.camera_to_worlds[:, :, 3]
+    origins = manager.cameras.camera_to_worlds[:, :, 3]
     rays = [manager.unseen_rays(40, np.random.default_rng(seed)) for seed in range(30)]
     assert all(len(bundle) == 40 for bundle in rays)
     assert all(len(bundle.origins.unique(dim=0)) == 1 for bundle in rays)  # a pose a step
@@ -150,7 +151,7 @@ def test_unseen_rays_are_uniform_in_images_between_training_views() -> None:
 def test_one_training_view_is_its_own_neighbour() -> None:
     manager = VanillaDataManagerConfig(train_num_rays_per_batch=5).setup(views=tiny_views(1, 8, 6))
     rays = manager.unseen_rays(10, np.random.default_rng(0))
-    expected = manager.train_ray_generator.cameras.camera_to_worlds[0, :, 3].expand(10, 3)
+    expected = manager.cameras.camera_to_worlds[0, :, 3].expand(10, 3)
     torch.testing.assert_close(rays.origins, expected)
 
 

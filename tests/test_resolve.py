@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny import tiny_views
 
-from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.errors import InputError

@@ -13,8 +13,8 @@ import pytest
 import torch
 from tiny import tiny_views
 
-from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import image_batch
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.show import probability_map, show
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.edges import edge_strength

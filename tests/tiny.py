@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import nn
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.data.cameras import Cameras, RayBundle
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import RayModel
@@ -86,10 +86,10 @@ def tiny_views(
     """Views of random pixels, from 4 world units away along their own z axis."""
     rng = np.random.default_rng(5)
     images = tuple(rng.integers(0, 256, (height, width, channels), dtype=np.uint8) for _ in range(count))
-    poses = np.concatenate((np.eye(3), [[0], [0], [4]]), axis=1)
-    lens = np.tile([7.0, 8.0], (count, 1))
-    middle = np.tile([width / 2, height / 2], (count, 1))
-    return Views(tuple(f"view {i}" for i in range(count)), images, masks, np.tile(poses, (count, 1, 1)), lens, middle)
+    pose = np.eye(4)
+    pose[2, 3] = 4
+    cameras = Cameras.of([pose] * count, fx=7, fy=8, cx=width / 2, cy=height / 2, width=width, height=height)
+    return Views(tuple(f"view {i}" for i in range(count)), images, masks, cameras)
 
 
 def check_gradients(model: nn.Module, loss: Callable[[], torch.Tensor]) -> None:

@@ -6,15 +6,17 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from edge_se_sampler.data import json_schema as field
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.image_file import ImageFile, read_image
 from edge_se_sampler.data.source_location import Where, shown
+from edge_se_sampler.data.views import Views
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -35,33 +37,6 @@ _SETTINGS: dict[str, field.Check[float]] = {
 }
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-
-@dataclass(frozen=True)
-class Views:
-    """One split of a scene as read from disk: n views."""
-
-    names: tuple[str, ...]  # file_path of each frame
-    images: tuple[np.ndarray, ...]  # view i: (H_i, W_i, 3|4) uint8, sRGB, straight alpha
-    masks: tuple[np.ndarray, ...] | None  # view i: (H_i, W_i) bool, True = may be trained on; None: no mask_path
-    camera_to_worlds: np.ndarray  # (n, 3, 4) float64; OpenGL axes: x right, y up, z back
-    focal: np.ndarray  # (n, 2) float64: fx, fy in pixels
-    principal: np.ndarray  # (n, 2) float64: cx, cy in pixels; pixel centres lie at +0.5
-
-    def subset(self, numbers: Sequence[int]) -> Views:
-        """The views of these numbers, in this order."""
-        chosen = list(numbers)
-        return Views(
-            tuple(self.names[i] for i in chosen),
-            tuple(self.images[i] for i in chosen),
-            None if self.masks is None else tuple(self.masks[i] for i in chosen),
-            *(values[chosen] for values in (self.camera_to_worlds, self.focal, self.principal)),
-        )
-
-    def masked(self, masks: Sequence[np.ndarray]) -> Views:
-        """The same views, of which only these pixels (and those that could be already) may be trained on."""
-        old = [True] * len(masks) if self.masks is None else self.masks
-        return replace(self, masks=tuple(mask & may for mask, may in zip(masks, old, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -124,14 +99,7 @@ def read_blender(folder: Path, split: Split) -> Views:
         masks = tuple(pool.map(_read_mask, mask_files, images)) if any(mask_files) else None
     if masks is not None and not any(mask.any() for mask in masks):
         raise where.key("frames").error("all pixels of all views are masked", "masks are non-zero where to train")
-    return Views(
-        names=tuple(frame.name for frame in frames),
-        images=images,
-        masks=masks,
-        camera_to_worlds=np.stack([frame.pose for frame in frames]),
-        focal=np.array([_focal(*pair, half_tan) for pair in zip(frames, images, strict=True)]),
-        principal=np.array([_principal(*pair) for pair in zip(frames, images, strict=True)]),
-    )
+    return Views(tuple(frame.name for frame in frames), images, masks, _cameras(frames, images, half_tan))
 
 
 def _check_folder(folder: Path, split: str) -> None:
@@ -276,13 +244,16 @@ def _read_mask(file: ImageFile | None, image: np.ndarray) -> np.ndarray:
     return np.any(colours, axis=-1)
 
 
-def _focal(frame: _Frame, image: np.ndarray, half_tan: float) -> tuple[float, float]:
-    """fx, fy in pixels; without fl_y pixels are square."""
-    fx = frame.get("fl_x", 0.5 * image.shape[1] / half_tan)
-    return fx, frame.get("fl_y", fx)
-
-
-def _principal(frame: _Frame, image: np.ndarray) -> tuple[float, float]:
-    """cx, cy in pixels; without them the image's middle."""
-    height, width = image.shape[:2]
-    return frame.get("cx", width / 2), frame.get("cy", height / 2)
+def _cameras(frames: Sequence[_Frame], images: Sequence[np.ndarray], half_tan: float) -> Cameras:
+    """The frames' cameras; without fl_y pixels are square, without cx and cy the principal point is the center."""
+    height, width = np.array([image.shape[:2] for image in images]).T
+    fx = [frame.get("fl_x", 0.5 * w / half_tan) for frame, w in zip(frames, width.tolist(), strict=True)]
+    return Cameras.of(
+        [frame.pose for frame in frames],
+        fx=fx,
+        fy=[frame.get("fl_y", x) for frame, x in zip(frames, fx, strict=True)],
+        cx=[frame.get("cx", w / 2) for frame, w in zip(frames, width.tolist(), strict=True)],
+        cy=[frame.get("cy", h / 2) for frame, h in zip(frames, height.tolist(), strict=True)],
+        width=width,
+        height=height,
+    )

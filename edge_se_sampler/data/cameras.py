@@ -1,13 +1,16 @@
-"""Pixels -> rays, with nerfstudio's names.
+"""Cameras: pixels to rays and points to pixels, with nerfstudio's names.
 
-Camera axes are OpenGL's: x right, y up, z back. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+Camera axes are OpenGL's: x right, y up, z back. Pixel (row, column) has its center at (column + 0.5, row + 0.5).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 
@@ -34,16 +37,16 @@ class RayBundle:
 
 @dataclass(frozen=True)
 class Cameras:
-    """n pinhole cameras."""
+    """n pinhole cameras, all tensors but the sizes of one floating-point type."""
 
     camera_to_worlds: Tensor
-    """(n, 3, 4) float32: rotation | position."""
+    """(n, 3, 4): rotation | position in world units."""
     fx: Tensor
-    """(n, 1) pixels."""
+    """(n, 1) focal length, pixels."""
     fy: Tensor
     """(n, 1) pixels."""
     cx: Tensor
-    """(n, 1) pixels."""
+    """(n, 1) principal point, pixels."""
     cy: Tensor
     """(n, 1) pixels."""
     width: Tensor
@@ -51,35 +54,52 @@ class Cameras:
     height: Tensor
     """(n, 1) int64 pixels."""
 
+    @classmethod
+    def of(
+        cls,
+        camera_to_worlds: ArrayLike,
+        *,
+        fx: ArrayLike,
+        fy: ArrayLike,
+        cx: ArrayLike,
+        cy: ArrayLike,
+        width: ArrayLike,
+        height: ArrayLike,
+    ) -> Cameras:
+        """Cameras in float64 from (n, 3|4, 4) matrices and intrinsics in pixels, (n,) or one number for all."""
+        poses = np.asarray(camera_to_worlds, dtype=np.float64)[:, :3]
+
+        def column(values: ArrayLike, dtype: type) -> Tensor:
+            return torch.from_numpy(np.broadcast_to(values, len(poses)).astype(dtype)[:, None])
+
+        return cls(
+            torch.from_numpy(poses),
+            *(column(values, np.float64) for values in (fx, fy, cx, cy)),
+            *(column(values, np.int64) for values in (width, height)),
+        )
+
     def __len__(self) -> int:
         return len(self.camera_to_worlds)
 
-    def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras on a device."""
-        return Cameras(**{key: value.to(device) for key, value in vars(self).items()})
+    def __getitem__(self, indices: slice | Sequence[int]) -> Cameras:
+        """The cameras of these indices, in this order."""
+        return Cameras(**{key: value[indices] for key, value in vars(self).items()})
 
-    def between(self, first: int, second: int, share: float) -> Cameras:
-        """One camera on the way from one to another, with the first one's lens and size.
-
-        It turns at an even rate, and the world's origin moves evenly in its view: between cameras that look at one
-        point it looks there too.
-
-        Args:
-            share: of the way, in [0, 1].
-        """
-        a, b = self.camera_to_worlds[first].double(), self.camera_to_worlds[second].double()
-        rotation = a[:, :3] @ rotation_power(a[:, :3].T @ b[:, :3], share)
-        seen = torch.lerp(a[:, :3].T @ a[:, 3], b[:, :3].T @ b[:, 3], share)
-        pose = torch.cat((rotation, (rotation @ seen)[:, None]), dim=1).to(self.camera_to_worlds)
-        lens = {key: value[first : first + 1] for key, value in vars(self).items() if key != "camera_to_worlds"}
-        return Cameras(camera_to_worlds=pose[None], **lens)
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
+        """The same cameras on a device, in a floating-point type."""
+        return Cameras(
+            **{
+                key: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+                for key, value in vars(self).items()
+            }
+        )
 
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
         """One ray for each coordinate.
 
         Args:
             camera_indices: (n, 1) int64.
-            coords: (n, 2) float: y, x in pixels (a pixel's centre is its row + 0.5, column + 0.5).
+            coords: (n, 2) float: y, x in pixels (a pixel's center is its row + 0.5, column + 0.5).
         """
         c = camera_indices[:, 0]
         x = (coords[:, 1:] - self.cx[c]) / self.fx[c]
@@ -90,32 +110,58 @@ class Cameras:
         norm = directions.norm(dim=1, keepdim=True)
         return RayBundle(pose[:, :, 3], directions / norm, camera_indices, {"directions_norm": norm})
 
+    def pixel_rays(self, pixels: Tensor) -> RayBundle:
+        """Rays through the centers of pixels: (n, 3) int64 camera, row, column -> n rays."""
+        pixels = pixels.to(self.fx.device)
+        return self.generate_rays(pixels[:, :1], pixels[:, 1:] + 0.5)
 
-def rotation_power(rotation: Tensor, share: float) -> Tensor:
-    """A share of a rotation's angle about its axis, (3, 3) -> (3, 3) float64; of half a turn, in either sense."""
+    def image_rays(self, camera: int) -> RayBundle:
+        """All rays of one camera, row by row."""
+        height, width = int(self.height[camera]), int(self.width[camera])
+        return self.pixel_rays(torch.cartesian_prod(torch.tensor([camera]), torch.arange(height), torch.arange(width)))
+
+    def project(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Where one camera sees points: the inverse of `generate_rays`.
+
+        Args:
+            points: (m, 3) world units.
+
+        Returns:
+            coords (m, 2): y, x in pixels, without meaning for points that are not in front of the camera.
+            depth (m,): along the optical axis, world units; positive in front of the camera.
+        """
+        pose = self.camera_to_worlds[camera]
+        right, up, back = pose[:, :3].T @ (points - pose[:, 3]).T
+        depth = -back
+        y = self.cy[camera] - up / depth * self.fy[camera]
+        x = self.cx[camera] + right / depth * self.fx[camera]
+        return torch.stack((y, x), dim=1), depth
+
+    def interpolate(self, first: int, second: int, fraction: float) -> Cameras:
+        """One camera on the way from one to another, with the first one's intrinsics and size.
+
+        It rotates at an even rate, and the world's origin moves evenly in its view: between cameras that look at one
+        point it looks there too.
+
+        Args:
+            fraction: of the way, in [0, 1].
+        """
+        a, b = self.camera_to_worlds[first].double(), self.camera_to_worlds[second].double()
+        rotation = a[:, :3] @ rotation_power(a[:, :3].T @ b[:, :3], fraction)
+        origin_in_camera = torch.lerp(a[:, :3].T @ a[:, 3], b[:, :3].T @ b[:, 3], fraction)
+        pose = torch.cat((rotation, (rotation @ origin_in_camera)[:, None]), dim=1).to(self.camera_to_worlds)
+        return replace(self[[first]], camera_to_worlds=pose[None])
+
+
+def rotation_power(rotation: Tensor, exponent: float) -> Tensor:
+    """The rotation by `exponent` times a rotation's angle about its axis, (3, 3) -> (3, 3) float64.
+
+    An angle of pi may be taken in either sense.
+    """
     rotation = rotation.double()
     axis = torch.linalg.eigh((rotation + rotation.T) / 2).eigenvectors[:, 2]  # of the eigenvalue 1, the largest
     x, y, z = axis.tolist()
     skew = rotation.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     sine = (skew * rotation).sum() / 2  # the trace is 1 + 2 cos, the skew part the axis times sin
-    angle = share * torch.atan2(sine, (rotation.trace() - 1) / 2)
+    angle = exponent * torch.atan2(sine, (rotation.trace() - 1) / 2)
     return torch.eye(3).to(rotation) + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
-
-
-class RayGenerator:
-    """Sampled pixels -> their rays."""
-
-    def __init__(self, cameras: Cameras) -> None:
-        self.cameras = cameras
-
-    def __call__(self, ray_indices: Tensor) -> RayBundle:
-        """(n, 3) int64 camera, row, column -> n rays."""
-        ray_indices = ray_indices.to(self.cameras.fx.device)
-        return self.cameras.generate_rays(ray_indices[:, :1], ray_indices[:, 1:] + 0.5)
-
-    def image(self, camera: int) -> RayBundle:
-        """All rays of one camera, row-major."""
-        size = int(self.cameras.height[camera]), int(self.cameras.width[camera])
-        row, column = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
-        rows = torch.stack((torch.full_like(row, camera), row, column), dim=-1)
-        return self(rows.reshape(-1, 3))

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import Cameras, RayBundle, RayGenerator
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.config import VanillaDataManagerConfig
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import (
     PixelSampler,
@@ -45,7 +45,7 @@ class VanillaDataManager:
         self.config = config
         self.device = device
         self.image_batch = image_batch(views)
-        self.train_ray_generator = RayGenerator(cameras_of(views).to(device))
+        self.cameras = views.cameras.to(device, torch.float32)
         # a host's sampler may write into its config
         self.train_pixel_sampler = copy.copy(config.pixel_sampler).setup(
             num_rays_per_batch=config.train_num_rays_per_batch, background_color=background_color
@@ -58,7 +58,7 @@ class VanillaDataManager:
         batch = self.train_pixel_sampler.sample(self.image_batch)
         batch["image"] = unit_interval(batch["image"])
         batch |= {key: value.to(self.device) for key, value in batch.items() if key != "full_image"}
-        return self.train_ray_generator(batch["indices"]), batch
+        return self.cameras.pixel_rays(batch["indices"]), batch
 
     def observe(self, squared_error: Tensor) -> None:
         """Tell the sampler the (N,) squared errors that training found on the last batch."""
@@ -77,20 +77,13 @@ class VanillaDataManager:
 
     def probe_rays(self, n: int, rng: np.random.Generator) -> RayBundle:
         """n rays, uniform in the training images."""
-        cameras = self.train_ray_generator.cameras
-        numbers = rng.integers(len(cameras), size=n)
-        size = torch.cat((cameras.height, cameras.width), dim=1).cpu()[numbers]
-        pixels = torch.from_numpy(rng.random((n, 2)) * size.numpy()).long()
-        return self.train_ray_generator(torch.cat((torch.from_numpy(numbers)[:, None], pixels), dim=1))
+        return random_rays(self.cameras, rng.integers(len(self.cameras), size=n), rng)
 
     def unseen_rays(self, n: int, rng: np.random.Generator) -> RayBundle:
         """n rays, uniform in the image of a camera somewhere between two training cameras."""
-        cameras = self.train_ray_generator.cameras
-        first, second = rng.choice(len(cameras), size=2, replace=len(cameras) < 2).tolist()
-        camera = cameras.between(first, second, rng.random())
-        size = torch.cat((camera.height[0], camera.width[0])).cpu()
-        pixels = torch.from_numpy(rng.random((n, 2)) * size.numpy()).long()
-        return RayGenerator(camera)(torch.cat((torch.zeros((n, 1), dtype=torch.int64), pixels), dim=1))
+        first, second = rng.choice(len(self.cameras), size=2, replace=len(self.cameras) < 2).tolist()
+        camera = self.cameras.interpolate(first, second, rng.random())
+        return random_rays(camera, np.zeros(n, dtype=np.int64), rng)
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
         """Bind an important-pixel sampler to the run; the callback tells it the step."""
@@ -99,7 +92,7 @@ class VanillaDataManager:
             return []
         sampler.bind(
             squared_error=scoring(
-                sampler, training_callback_attributes.pipeline, self.train_ray_generator, self.ray_errors
+                sampler, training_callback_attributes.pipeline, self.cameras.pixel_rays, self.ray_errors
             ),
             planned_steps=trainer.planned_steps,
             seed=trainer.config.machine.seed,
@@ -114,6 +107,13 @@ class VanillaDataManager:
         if isinstance(settings, SamplingSettings) and settings.error_source == "coarse":
             return torch.cat([model.coarse_squared_error(ray_bundle[rows], image[rows]) for rows in chunks])
         return torch.cat([model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in chunks])
+
+
+def random_rays(cameras: Cameras, camera_indices: np.ndarray, rng: np.random.Generator) -> RayBundle:
+    """A ray through a pixel drawn uniformly from the image of each of (n,) cameras."""
+    size = torch.cat((cameras.height, cameras.width), dim=1).cpu().numpy()[camera_indices]
+    pixels = (rng.random((len(camera_indices), 2)) * size).astype(np.int64)
+    return cameras.pixel_rays(torch.from_numpy(np.concatenate((camera_indices[:, None], pixels), axis=1)))
 
 
 def unit_interval(image: Tensor) -> Tensor:
@@ -144,19 +144,3 @@ def _with_channels(image: np.ndarray, channels: int) -> np.ndarray:
     if image.shape[2] == channels:
         return image
     return np.concatenate((image, np.full_like(image[..., :1], 255)), axis=2)
-
-
-def cameras_of(views: Views) -> Cameras:
-    """The views' cameras."""
-    sizes = torch.tensor([image.shape[:2] for image in views.images])
-    focal = torch.from_numpy(views.focal).float()
-    principal = torch.from_numpy(views.principal).float()
-    return Cameras(
-        camera_to_worlds=torch.from_numpy(views.camera_to_worlds).float(),
-        fx=focal[:, :1],
-        fy=focal[:, 1:],
-        cx=principal[:, :1],
-        cy=principal[:, 1:],
-        width=sizes[:, 1:],
-        height=sizes[:, :1],
-    )

@@ -16,11 +16,12 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.blender import SPLITS, Split, Views, has_split, listed_file, read_blender, transforms_path
+from edge_se_sampler.data.blender import SPLITS, Split, has_split, listed_file, read_blender, transforms_path
 from edge_se_sampler.data.canvas import TWINS, Canvas, background, object_pixels
 from edge_se_sampler.data.json_schema import Object, load_object
 from edge_se_sampler.data.new_folder import appearing, check_free
 from edge_se_sampler.data.source_location import Where, shown
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
 Shares = tuple[float, float]  # of an image's width and height
@@ -154,12 +155,12 @@ def _document(split: _Split, views: Views, canvases: Sequence[Canvas], twin: str
         {
             "w": canvas.size[0],
             "h": canvas.size[1],
-            "fl_x": float(focal[0]),
-            "fl_y": float(focal[1]),
-            "cx": float(principal[0]) + canvas.corners[twin][0],
-            "cy": float(principal[1]) + canvas.corners[twin][1],
+            "fl_x": float(views.cameras.fx[i]),
+            "fl_y": float(views.cameras.fy[i]),
+            "cx": float(views.cameras.cx[i]) + canvas.corners[twin][0],
+            "cy": float(views.cameras.cy[i]) + canvas.corners[twin][1],
         }
-        for canvas, focal, principal in zip(canvases, views.focal, views.principal, strict=True)
+        for i, canvas in enumerate(canvases)
     ]
     shared = {key: value for key, value in cameras[0].items() if all(camera[key] == value for camera in cameras)}
     top = {key: value for key, value in split.document.items() if key not in cameras[0]} | shared

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayBundle, RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.cameras import Cameras, RayBundle
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.metrics import composite_on, compute_metrics, psnr
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.sampling.edges import unit_float
@@ -24,19 +23,17 @@ class Picture:
     name: str
     image: np.ndarray
     """(H, W, 3|4) float32 in [0, 1], straight alpha."""
-    generator: RayGenerator
-    camera: int
+    camera: Cameras
+    """The one that took it."""
 
     def rays(self, device: torch.device) -> RayBundle:
         """Its H * W rays."""
-        return RayGenerator(self.generator.cameras.to(device)).image(self.camera)
+        return self.camera.to(device, torch.float32).image_rays(0)
 
 
 def pictures_of(views: Views) -> list[Picture]:
     """All views of a split."""
-    generator = RayGenerator(cameras_of(views))
-    names = enumerate(views.names)
-    return [Picture(name, unit_float(views.images[i]), generator, i) for i, name in names]
+    return [Picture(name, unit_float(views.images[i]), views.cameras[[i]]) for i, name in enumerate(views.names)]
 
 
 def get_background_color(model: RayModel) -> float:

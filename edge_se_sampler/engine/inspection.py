@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.models.config import LeanModelConfig, apply_preset, preset_of, size_for
 from edge_se_sampler.occupancy.grid import OccupancyGrid
@@ -49,7 +48,7 @@ def _lines(views: Views, told: SceneAnalysis, live: list[np.ndarray], config: Le
     first = hull.side * 2**told.coarser
     finest = first / 2**told.splits
     samples, along = _samples(views, told, live, config)
-    distance = np.linalg.norm(views.camera_to_worlds[:, :, 3] - box.middle, axis=1)
+    distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.middle, axis=1)
     at = ", ".join(f"{value + 0.0:.2f}" for value in box.middle.round(2))
     across = np.mean(np.concatenate([pixels.ravel() for pixels in live]))
     size = size_for(max(max(size) for size in sizes))
@@ -82,7 +81,7 @@ def _samples(views: Views, told: SceneAnalysis, live: list[np.ndarray], config: 
     """Samples of a live ray: in the hull, and along the box's whole side; the first a mean over some."""
     step = config.step_size_voxels * told.hull.side
     chosen = spread_pixels(dict(enumerate(live)), RAYS)
-    rays = RayGenerator(cameras_of(views))(chosen)
+    rays = views.cameras.to(dtype=torch.float32).pixel_rays(chosen)
     samples = OccupancyGrid.of(told.hull).march(rays, step, None, (config.near, config.far))
     return len(samples.t) / len(chosen), 2 * told.box.half / step
 

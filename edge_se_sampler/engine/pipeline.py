@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import VanillaDataManager
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.scene_analysis import analyze_scene, live_pixels
@@ -33,7 +33,7 @@ class Pipeline:
             model.settle(told.grid())
             has_masks = told.silhouettes > 0
             if manager_config.skip_empty_rays and has_masks:
-                views = views.masked(live_pixels(views, told.hull))
+                views = views.with_masks(live_pixels(views, told.hull))
         if isinstance(manager_config.pixel_sampler, SamplingSettings):
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do

@@ -13,7 +13,6 @@ from edge_se_sampler.engine.evaluation import (
     Picture,
     evaluate,
     get_background_color,
-    pictures_of,
     render_rays,
 )
 from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
@@ -23,6 +22,7 @@ from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_views, test_pictures
 from edge_se_sampler.engine.video import check_video, write_video
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling.edges import unit_float
 
 
 def evaluate_run(
@@ -72,9 +72,9 @@ def render_run(
     model, _ = load_model(run, config)
     pictures = test_pictures(config)
     if kind == "spiral":
-        train = pictures_of(read_views(config))
-        generator = type(train[0].generator)(spiral(train[0].generator.cameras, num_frames))
-        pictures = [Picture(f"{i}", train[0].image, generator, i) for i in range(num_frames)]
+        train = read_views(config)
+        cameras = spiral(train.cameras, num_frames)
+        pictures = [Picture(f"{i}", unit_float(train.images[0]), cameras[[i]]) for i in range(num_frames)]
     progress = Progress(len(pictures), "rendering")
     frames = []
     for i, picture in enumerate(pictures):

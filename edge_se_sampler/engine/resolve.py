@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import (

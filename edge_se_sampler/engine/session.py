@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_se_sampler.data.blender import Views, has_split, read_blender
+from edge_se_sampler.data.blender import has_split, read_blender
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import Picture, pictures_of

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge_se_sampler.data.blender import Views
 from edge_se_sampler.data.datamanager import image_batch
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.errors import InputError

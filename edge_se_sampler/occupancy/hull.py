@@ -6,8 +6,9 @@ a_x, ...  half of the cell along those axes: h/2 times the sum of |rotation| ove
 u, v   pixels right and down; f, c: focal length and principal point, pixels
 
 A point of the cell lies at (x + e_x, z + e_z) with |e_x| <= a_x, |e_z| <= a_z, so its pixel is within
-f (a_x z + |x| a_z) / (z (z - a_z)) of the centre's. A cell goes only where that whole rectangle and a margin are
-background in several views: a mask that is a little too small, or shifted, or empty in one view, carves nothing away.
+f (a_x z + |x| a_z) / (z (z - a_z)) = (f a_x + |u - c| a_z) / (z - a_z) of the centre's. A cell goes only where that
+whole rectangle and a margin are background in several views: a mask that is a little too small, or shifted, or empty
+in one view, carves nothing away.
 What lies outside of an image counts as background if its silhouette keeps clear of the border, for then the image
 shows the whole object. Carving begins with large cells and splits those that stay.
 """
@@ -18,8 +19,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
-from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.views import Views
 
 MARGIN = 2
 """Pixels that a silhouette may be too small, or moved."""
@@ -29,8 +32,6 @@ FIRST_CELLS = 16
 """Cells along the box when carving begins."""
 FEWER = 0.8
 """Share of cells still in question below which the others are dropped: copying costs, too."""
-ROUNDED = 1e-5
-"""Projections are float32, which is a hundredth of a pixel in the largest image."""
 IN_FRONT, STRADDLING, BEHIND = 1, 0, -1
 """Where a cell is, seen from a camera's plane."""
 
@@ -82,7 +83,7 @@ def box_of(views: Views, near: float, far: float) -> Box:
     Args:
         near, far: depths between which rays are sampled, world units.
     """
-    position, ahead = views.camera_to_worlds[:, :, 3], -views.camera_to_worlds[:, :, 2]
+    position, ahead = _optical_axes(views.cameras)
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     middle = np.linalg.lstsq(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=None)[0]
     depth = ((middle - position) * ahead).sum(axis=1)
@@ -94,9 +95,16 @@ def box_of(views: Views, near: float, far: float) -> Box:
 
 def footprint(views: Views, box: Box) -> float:
     """Median size of a pixel at the box's middle, world units: depth / focal length."""
-    position, ahead = views.camera_to_worlds[:, :, 3], -views.camera_to_worlds[:, :, 2]
+    position, ahead = _optical_axes(views.cameras)
     depth = ((box.middle - position) * ahead).sum(axis=1).clip(min=1e-6)
-    return float(np.median(depth / views.focal.mean(axis=1)))
+    focal = (views.cameras.fx + views.cameras.fy)[:, 0].numpy() / 2
+    return float(np.median(depth / focal))
+
+
+def _optical_axes(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Of each camera, where it is and the unit vector along which it looks, (n, 3) each."""
+    poses = cameras.camera_to_worlds.numpy()
+    return poses[:, :, 3], -poses[:, :, 2]
 
 
 def silhouettes(views: Views) -> dict[int, Silhouette]:
@@ -157,7 +165,7 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
     empty = np.zeros(len(centers), dtype=np.int32)
     seen = np.zeros(len(centers), dtype=bool)
     for number, image in enumerate(views.images):
-        low, high, where = projected(views, number, centers[left], side)
+        low, high, where = projected(views.cameras, number, centers[left], side)
         height, width = image.shape[:2]
         ahead = where == IN_FRONT
         inside = (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
@@ -174,19 +182,23 @@ def _stays(views: Views, shown: dict[int, Silhouette], centers: np.ndarray, side
     return stays
 
 
-def projected(views: Views, number: int, centers: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def projected(
+    cameras: Cameras, camera: int, centers: np.ndarray, side: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rectangles that cells project into: least and greatest u, v (2, m), and whether each cell is all IN_FRONT, all
-    BEHIND, or STRADDLING the camera's plane (m,); only those ahead have a rectangle that means something."""
-    pose = views.camera_to_worlds[number]
-    axes = pose[:, :3] * (1, -1, -1)
-    x, y, z = (axes.T @ (centers - pose[:, 3]).T).astype(np.float32)
-    half_x, half_y, half_z = (side / 2 * np.abs(axes).sum(axis=0)).tolist()
-    where = np.where(z > half_z * (1 + ROUNDED), IN_FRONT, np.where(z < -half_z * (1 + ROUNDED), BEHIND, STRADDLING))
-    z = np.where(where == IN_FRONT, z, half_z + 1)
-    reach = 1 / (z * (z - half_z))
-    low, high = np.empty((2, 2, len(z)), dtype=np.float32)
-    for k, (along, half) in enumerate(((x, half_x), (y, half_y))):
-        focal, principal = float(views.focal[number, k]), float(views.principal[number, k])
-        at, off = along / z * focal + principal, (half * z + np.abs(along) * half_z) * reach * focal
-        low[k], high[k] = at - off, at + off
+    BEHIND, or STRADDLING the camera's plane (m,); only those in front have a rectangle that means something."""
+    coords, z = (values.numpy() for values in cameras.project(camera, torch.from_numpy(centers)))
+    rotation = cameras.camera_to_worlds[camera, :, :3].numpy()
+    half_x, half_y, half_z = side / 2 * np.abs(rotation).sum(axis=0)
+    where = np.where(z > half_z, IN_FRONT, np.where(z < -half_z, BEHIND, STRADDLING))
+    closest = np.where(where == IN_FRONT, z - half_z, np.inf)
+    low, high = np.empty((2, 2, len(z)))
+    for k, (center, focal, principal, half) in enumerate(
+        (
+            (coords[:, 1], cameras.fx, cameras.cx, half_x),
+            (coords[:, 0], cameras.fy, cameras.cy, half_y),
+        )
+    ):
+        extent = (half * float(focal[camera]) + np.abs(center - float(principal[camera])) * half_z) / closest
+        low[k], high[k] = center - extent, center + extent
     return low, high, where

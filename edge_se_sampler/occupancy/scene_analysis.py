@@ -10,9 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayGenerator
-from edge_se_sampler.data.datamanager import cameras_of
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, ModelConfig
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
@@ -113,7 +111,7 @@ def _hull(views: Views, shown: dict[int, Silhouette], box: Box, side: float, mos
 def _missed(views: Views, shown: dict[int, Silhouette], hull: Hull) -> float:
     """Share of the foreground's pixels, or of some of them, whose ray meets no cell."""
     some = spread_pixels({i: views.images[i][..., 3] > 0 for i in shown}, LOOKED_AT)
-    rays = RayGenerator(cameras_of(views))(some)
+    rays = views.cameras.to(dtype=torch.float32).pixel_rays(some)
     met = OccupancyGrid.of(hull).march(rays, hull.side / 4, None).ray_indices
     return 1 - len(met.unique()) / len(some)
 
@@ -149,7 +147,7 @@ def _covered(views: Views, number: int, centers: np.ndarray, side: float) -> np.
     """Pixels covered by cells: their middles, made as large as the largest of their rectangles; all of them, if a cell
     is around the camera or as large as the image."""
     height, width = views.images[number].shape[:2]
-    low, high, where = projected(views, number, centers, side)
+    low, high, where = projected(views.cameras, number, centers, side)
     shown = (where == IN_FRONT) & (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
     low, high = low[:, shown], high[:, shown]
     reach = int(np.ceil((high - low).max(initial=0) / 2)) + 1

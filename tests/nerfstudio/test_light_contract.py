@@ -37,8 +37,9 @@ from nerfstudio.data.pixel_samplers import (  # noqa: E402
 )
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation  # noqa: E402
 
-from edge_se_sampler.data.blender import Views, read_blender  # noqa: E402
+from edge_se_sampler.data.blender import read_blender  # noqa: E402
 from edge_se_sampler.data.config import VanillaDataManagerConfig  # noqa: E402
+from edge_se_sampler.data.views import Views  # noqa: E402
 from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig  # noqa: E402
 from edge_se_sampler.engine.pipeline import Pipeline  # noqa: E402
 from edge_se_sampler.engine.resolve import resolve_config  # noqa: E402

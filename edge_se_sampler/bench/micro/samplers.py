@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.machine import machine, resident_memory
-from edge_se_sampler.data.blender import Views
+from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.resolve import resolve_config
@@ -139,10 +140,10 @@ def peak_bytes(method: str, rays: int, size: str, scoring: str) -> float:
 def training_peak(method: str, rays: str, size: str, scoring: str) -> int:
     """Resident bytes, above the level after imports, of a few late training steps."""
     noise = np.random.default_rng(0).integers(0, 256, (8, 100, 100, 3), dtype=np.uint8)
-    pose = np.eye(4)[:3]
+    pose = np.eye(4)
     pose[2, 3] = 4
-    lens = np.full((8, 2), 100.0)
-    views = Views(tuple("abcdefgh"), tuple(noise), None, np.tile(pose, (8, 1, 1)), lens, lens / 2)
+    cameras = Cameras.of([pose] * 8, fx=100, fy=100, cx=50, cy=50, width=100, height=100)
+    views = Views(tuple("abcdefgh"), tuple(noise), None, cameras)
     config = method_configs()[method]
     how = scoring if method == "se-nerf" else "fine"
     sampler = replace(config.pipeline.datamanager.pixel_sampler, early_fraction=0.0, error_source=how)

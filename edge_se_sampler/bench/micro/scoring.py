@@ -101,7 +101,7 @@ def rankings(trainer: Trainer, step: int) -> dict[str, float]:
     numbers = rng.integers(len(images), size=COMPARED)
     pixels = [(n, *rng.integers(images[n].shape[:2])) for n in numbers.tolist()]
     indices = torch.tensor(pixels)
-    rays = manager.train_ray_generator(indices)
+    rays = manager.cameras.pixel_rays(indices)
     image = torch.stack([images[n][row, column] for n, row, column in pixels]).float() / 255
     scores: dict[str, list[torch.Tensor]] = {"fine": [], "coarse": []}
     model.eval()

@@ -17,7 +17,8 @@ import numpy as np
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, STRATEGIES
 from edge_se_sampler.bench.paper.trials import PAPERS, TABLES, Cell
 from edge_se_sampler.bench.paper.verdicts import LABEL, failed
-from edge_se_sampler.data.blender import Views, read_blender
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import edge_band
 from edge_se_sampler.sampling.edges import edge_strength, unit_float

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.bench.stability.settings import Background
-from edge_se_sampler.data.blender import Views
-from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.synthetic.cameras import poses
 from edge_se_sampler.data.synthetic.render import render_view
+from edge_se_sampler.data.views import Views
 
 SCENE = "materials"
 """Compact: it fits into the image at f = 30 %, and at 10 % off centre."""
@@ -61,9 +61,7 @@ def _rendered(split: str, focal: float, shifted: bool, count: int) -> Views:
         tuple(f"{split}/r_{i}" for i in range(count)),
         images,
         None,
-        np.stack([pose[:3] for pose in matrices]),
-        np.full((count, 2), focal),
-        np.tile(np.array(principal), (count, 1)),
+        Cameras.of(matrices, fx=focal, fy=focal, cx=principal[0], cy=principal[1], width=SIZE, height=SIZE),
     )
 
 
