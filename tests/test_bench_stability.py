@@ -172,7 +172,7 @@ def test_a_point_is_trained_as_it_says(point: Point, tmp_path: Path) -> None:
     assert len(trainer.pipeline.datamanager.image_batch["image"]) == point.views
     assert trainer.pipeline.model.config.density_noise == point.noise
     assert trainer.pipeline.datamanager.train_pixel_sampler.watch is not None
-    assert trainer.revival is not None
+    assert trainer.dead_network_reset is not None
     outputs = trainer.pipeline.model(pictures[0].rays(torch.device("cpu"))[:5])
     expected = background_of(point.background)
     if expected is not None:

@@ -13,8 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from tiny import SMALL
-
-from edge_se_sampler.engine.trainer import Trainer
+from torch.optim.lr_scheduler import LambdaLR
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -248,7 +247,7 @@ def test_too_little_memory_is_told_in_one_line(scene: Path, tmp_path: Path, edge
 def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
     previews: int, scene: Path, tmp_path: Path, edge_se, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(Trainer, "learning_rate", lambda self, step: 1e-3 if step < 3 else float("inf"))
+    monkeypatch.setattr(LambdaLR, "get_lr", lambda self: [1e-3 if self.last_epoch < 3 else float("inf")])
     flags = ["--steps-per-eval-image", previews, "--steps-per-save", 1, "--output-dir", tmp_path / "o"]
     answer = edge_se("train", "vanilla-nerf", "--data", scene, *SMALL, *flags)
     assert answer.code == 1

@@ -192,7 +192,7 @@ def test_unseen_rays_are_asked_for_their_entropy() -> None:
         model.fine.density.bias.add_(1)  # something to hit
     rays = tiny_rays(6)
     model.begin_step(0, seed=1)
-    loss = model.unseen_loss(rays)
+    loss = model.auxiliary_loss(rays)
     model.begin_step(0, seed=1)
     outputs = model(rays)
     alpha = 1 - torch.exp(-outputs["density_fine"] * outputs["delta_fine"])
@@ -209,7 +209,7 @@ def test_the_gain_is_added_to_seen_and_unseen_rays_and_off_by_default() -> None:
             model.fine.density.bias.add_(1)
         model.begin_step(0, seed=1)
         model.random.manual_seed(1)  # the gain's turn has moved it on
-        return model.training_loss(tiny_rays(6), batch)[0].detach(), model.unseen_loss(tiny_rays(6)).detach()
+        return model.training_loss(tiny_rays(6), batch)[0].detach(), model.auxiliary_loss(tiny_rays(6)).detach()
 
     alone, _ = losses(3.0, num_unseen_rays=0)
     (seen, unseen), (plain, nothing) = losses(3.0), losses(0.0)
@@ -242,7 +242,7 @@ def test_a_step_minimises_the_error_and_the_entropy_of_as_many_unseen_rays() -> 
 
     manager.unseen_rays = counted
     seen, entropy = [], []
-    for name, kept in (("training_loss", seen), ("unseen_loss", entropy)):
+    for name, kept in (("training_loss", seen), ("auxiliary_loss", entropy)):
         method = getattr(model, name)
         setattr(model, name, lambda *a, method=method, kept=kept: (kept.append(method(*a)), kept[-1])[1])
     loss = trainer.train_iteration(0)

@@ -15,7 +15,7 @@ from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.trainer import Trainer, adam
+from edge_se_sampler.engine.trainer import Trainer, create_adam
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import nerf as model_module
 
@@ -100,11 +100,19 @@ def test_gradients_of_an_earlier_step_are_forgotten() -> None:
 
 def test_the_learning_rate_decays_to_its_final_fraction() -> None:
     trainer = trainer_of(steps=20, optimizer=OptimizerConfig(lr=0.01, final_fraction=0.25))
-    assert trainer.learning_rate(0) == 0.01
-    assert trainer.learning_rate(10) == pytest.approx(0.005)
-    assert trainer.learning_rate(20) == pytest.approx(0.0025)
-    trainer.train_iteration(10)
-    assert [group["lr"] for group in trainer.optimizer.param_groups] == [pytest.approx(0.005)]
+    rates = [trainer.scheduler.get_last_lr()]
+    for step in range(20):
+        trainer.train_iteration(step)
+        rates.append(trainer.scheduler.get_last_lr())
+    assert rates[0] == [0.01]
+    assert rates[10] == [pytest.approx(0.005)]
+    assert rates[20] == [pytest.approx(0.0025)]
+
+
+def test_groups_of_weights_have_their_own_learning_rates() -> None:
+    network, features = torch.nn.Parameter(torch.ones(3)), torch.nn.Parameter(torch.ones(2))
+    optimizer = create_adam([([network], 1.0), ([features], 6.0)], OptimizerConfig(lr=0.01))
+    assert [group["lr"] for group in optimizer.param_groups] == [0.01, pytest.approx(0.06)]
 
 
 @pytest.mark.parametrize("method", ["vanilla-nerf", "edge-se-nerf"])
@@ -143,16 +151,16 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_the_weights_are_spo
 
 @pytest.mark.parametrize("supported", [True, False])
 def test_a_fused_step_where_torch_has_one(supported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = torch.optim.Adam
+    adam = torch.optim.Adam
 
     def old(*arguments: Any, **settings: Any) -> torch.optim.Adam:
         if settings.get("fused") and not supported:
             raise RuntimeError("`fused=True` requires all the params to be floating point Tensors of supported devices")
-        return made(*arguments, **settings)
+        return adam(*arguments, **settings)
 
     monkeypatch.setattr(torch.optim, "Adam", old)
     weight = torch.nn.Parameter(torch.ones(3))
-    optimizer = adam([[weight]], OptimizerConfig(eps=1e-9, fused=True))
+    optimizer = create_adam([([weight], 1.0)], OptimizerConfig(lr=1e-3, eps=1e-9, fused=True))
     assert bool(optimizer.defaults["fused"]) == supported
     assert optimizer.defaults["eps"] == 1e-9
-    assert not adam([[weight]], OptimizerConfig()).defaults["fused"]
+    assert not create_adam([([weight], 1.0)], OptimizerConfig(lr=1e-3)).defaults["fused"]

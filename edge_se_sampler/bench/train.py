@@ -45,7 +45,7 @@ def trial(config: TrainerConfig) -> dict[str, Any]:
         **{key: results[key] for key in MEASURES},
         **judged(results, pictures, get_background_color(model)),
         "dead_at_start": dead,
-        "revived": sum("revived" in line for line in metrics),
+        "revived": sum("reinitialized" in line for line in metrics),
         "steps": trainer.next_step,
         "seconds": round(trainer.elapsed, 3),
         "cpu_seconds": round(cpu_seconds, 3),

@@ -1,6 +1,6 @@
 """Checkpoints that are whole or not there.
 
-A file is one line of text, "edge-se-checkpoint 1 <sha256 of the rest>", and then what torch.save wrote. Written to
+A file is one line of text, "edge-se-checkpoint 2 <sha256 of the rest>", and then what torch.save wrote. Written to
 a temporary file, flushed to the disk, renamed: a process killed at any moment leaves the old file or the new one.
 Loaded with weights_only=True, so a pickle in it is refused, never run.
 """
@@ -19,7 +19,7 @@ import torch
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 
-MAGIC = b"edge-se-checkpoint 1 "
+MAGIC = b"edge-se-checkpoint 2 "
 _NAME = re.compile(r"step-(\d{9,})\.ckpt")
 
 
@@ -70,7 +70,9 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({problem.strerror})") from problem
     header, _, payload = content.partition(b"\n")
     if not header.startswith(MAGIC):
-        raise InputError(f"{path}: not a checkpoint of edge-se; point to a run folder that edge-se train made")
+        raise InputError(
+            f"{path}: not a checkpoint of this version of edge-se; point to a run folder that its edge-se train wrote"
+        )
     if header[len(MAGIC) :] != hashlib.sha256(payload).hexdigest().encode():
         raise InputError(f"{path}: truncated or changed since it was saved (checksum); restore it or train again")
     try:

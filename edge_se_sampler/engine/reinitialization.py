@@ -1,8 +1,9 @@
-"""A second chance for dead networks.
+"""New initial weights for dead networks.
 
 With a ReLU a network whose raw density is negative at every sample has no gradient left: no sampler and no number
-of steps can help it. It may be born so, or training may kill it. Coarse and fine are revived each by itself: with a
-dead coarse network the fine one trains on evenly spread samples, with a dead fine one nothing is rendered.
+of steps can help it. Its initial weights may be so already, or training may bring it there. Coarse and fine network are
+reinitialized independently: with a dead coarse network the fine one trains on evenly spread samples, with a dead fine
+one nothing is rendered.
 """
 
 from __future__ import annotations
@@ -19,58 +20,68 @@ from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
 PATIENCE = 8
-"""Batches in a row without any density gradient, before the probe is asked."""
+"""Steps in a row without any density gradient, after which the probe rays are rendered."""
 PROBE_RAYS = 512
 
 
 def dead_networks(model: RayModel, probes: Iterable[RayBundle]) -> list[str]:
-    """Which of its networks have no density at any sample of the rays.
+    """Names of the model's networks that have no density at any sample of the rays.
 
-    The last interval is endless: the least density anywhere would make its ray opaque.
+    Accumulation tells: the last interval is endless, so that the smallest density anywhere makes its ray opaque.
     """
-    parts = list(probes)
-    return [lvl for lvl in model.networks if not any(render_rays(model, r, f"accumulation_{lvl}").any() for r in parts)]
+    probes = list(probes)
+    return [
+        name for name in model.networks if not any(render_rays(model, r, f"accumulation_{name}").any() for r in probes)
+    ]
 
 
 class DeadNetworkReset:
-    """Gives a dead network new initial weights, of the next sub-seed: a function of the seed and of how many have
-    been used, as everything random is.
+    """Gives a dead network new initial weights, of the next sub-seed: a function of the run's seed and of how many
+    sub-seeds have been used.
 
     Args:
-        probe: fixed rays that tell a dead network from one that has met empty batches.
+        probe: fixed rays, which tell a dead network from one whose last batches were empty.
         seed: the run's.
     """
 
     def __init__(self, model: RayModel, optimizer: torch.optim.Optimizer, probe: RayBundle, seed: int) -> None:
         self.model, self.optimizer, self.probe, self.seed = model, optimizer, probe, seed
-        self.silent = dict.fromkeys(model.networks, 0)
-        self.used = 0
+        self.steps_without_gradient = dict.fromkeys(model.networks, 0)
+        self.used_sub_seeds = 0
 
     def after_backward(self) -> dict[str, int]:
-        """Look at the gradients of a step; the networks that were given new weights, and of which sub-seed."""
+        """Look at a step's gradients, and reinitialize what is dead.
+
+        Returns:
+            the name of every network that was reinitialized -> its sub-seed.
+        """
         suspects = []
-        for level in self.model.networks:
-            gradient = getattr(self.model, level).density.weight.grad
-            self.silent[level] = 0 if gradient.any() else self.silent[level] + 1
-            if self.silent[level] >= PATIENCE:
-                suspects.append(level)
-                self.silent[level] = 0  # asked again after as many
+        for name in self.model.networks:
+            gradient = getattr(self.model, name).density.weight.grad
+            self.steps_without_gradient[name] = 0 if gradient.any() else self.steps_without_gradient[name] + 1
+            if self.steps_without_gradient[name] >= PATIENCE:
+                suspects.append(name)
+                self.steps_without_gradient[name] = 0
         if not suspects:
             return {}
-        dead = [level for level in dead_networks(self.model, [self.probe]) if level in suspects]
-        return {level: self._begin_anew(getattr(self.model, level)) for level in dead}
+        dead = [name for name in dead_networks(self.model, [self.probe]) if name in suspects]
+        return {name: self._reinitialize(getattr(self.model, name)) for name in dead}
 
-    def _begin_anew(self, field: NeRFField) -> int:
-        self.used += 1
-        field.initialize(self.model.config.initialization, stream(self.seed, self.used, Stream.WEIGHTS))
+    def _reinitialize(self, field: NeRFField) -> int:
+        self.used_sub_seeds += 1
+        field.initialize(self.model.config.initialization, stream(self.seed, self.used_sub_seeds, Stream.WEIGHTS))
         for weight in field.parameters():
             self.optimizer.state.pop(weight, None)
-        return self.used
+        return self.used_sub_seeds
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"silent": dict(self.silent), "used": self.used}
+        return {
+            "steps_without_gradient": dict(self.steps_without_gradient),
+            "used_sub_seeds": self.used_sub_seeds,
+        }
 
-    def load(self, state: dict[str, Any]) -> None:
-        """Go on where `state` was taken."""
-        self.silent, self.used = dict(state["silent"]), state["used"]
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.steps_without_gradient = dict(state["steps_without_gradient"])
+        self.used_sub_seeds = state["used_sub_seeds"]

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torch.optim.lr_scheduler import LambdaLR
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
@@ -21,7 +22,6 @@ from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.tensorboard import EventWriter
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.infonerf import InfoNeRFModel
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
@@ -39,9 +39,9 @@ class Trainer:
     def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
         self.planned_steps = config.max_num_iterations or 0
-        groups = pipeline.model.parameter_groups()
-        self.optimizer = adam([weights for weights, _ in groups], config.optimizer)
-        self.rates = [rate for _, rate in groups]
+        self.optimizer = create_adam(pipeline.model.parameter_groups(), config.optimizer)
+        decay = config.optimizer.final_fraction
+        self.scheduler = LambdaLR(self.optimizer, lambda step: decay ** (step / self.planned_steps))
         self.next_step = 0
         self.elapsed = 0.0
         self.events = EventWriter(run.path)
@@ -49,11 +49,11 @@ class Trainer:
         self.callbacks = self.pipeline.datamanager.get_training_callbacks(
             TrainingCallbackAttributes(pipeline=self.pipeline, trainer=self)
         )
-        self.revival: DeadNetworkReset | None = None
+        self.dead_network_reset: DeadNetworkReset | None = None
         if config.reinit_dead:
             seed = config.machine.seed
             probe = pipeline.datamanager.probe_rays(PROBE_RAYS, stream(seed, 0, Stream.PROBE))
-            self.revival = DeadNetworkReset(pipeline.model, self.optimizer, probe, seed)
+            self.dead_network_reset = DeadNetworkReset(pipeline.model, self.optimizer, probe, seed)
         self._preview_psnr: float | None = None
 
     def resume(self, state: dict[str, Any]) -> None:
@@ -64,9 +64,10 @@ class Trainer:
         """
         self.pipeline.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.scheduler.load_state_dict(state["scheduler"])
+        if self.dead_network_reset is not None:
+            self.dead_network_reset.load_state_dict(state["dead_network_reset"])
         self.pipeline.datamanager.load_state_dict(state["sampler"])
-        if self.revival is not None:
-            self.revival.load(state["revival"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
         self.run.forget_after(state["step"])
 
@@ -84,12 +85,13 @@ class Trainer:
         with self._interruptible():
             while self.next_step < self.planned_steps:
                 step = self.next_step
+                learning_rate = float(self.scheduler.get_last_lr()[0])
                 loss = self.train_iteration(step)
                 self.next_step, self.elapsed = step + 1, time.monotonic() - began
                 ended = self.next_step == self.planned_steps
                 stop = ended or self.stop_requested or time.monotonic() >= deadline
                 if ended or step % config.steps_per_log == 0:
-                    self._log(step, loss)
+                    self._log(step, loss, learning_rate)
                 if ended or self.next_step % (config.steps_per_eval_image or 1) == 0:
                     self._preview(step)
                     began = time.monotonic() - self.elapsed  # looking is not training
@@ -120,23 +122,22 @@ class Trainer:
             return part
 
         loss = self._backward(len(rays), seen_loss)
-        if isinstance(model, InfoNeRFModel) and model.num_unseen_rays:
-            rng = stream(seed, step, Stream.UNSEEN)
-            unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, rng)
-            loss += self._backward(len(unseen), lambda rows: model.unseen_loss(unseen[rows]))
-        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * self.learning_rate(step)
+        if model.num_unseen_rays:
+            unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, stream(seed, step, Stream.UNSEEN))
+            loss += self._backward(len(unseen), lambda rows: model.auxiliary_loss(unseen[rows]))
         value = float(loss)
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
-        if self.revival is not None:
-            for level, sub_seed in self.revival.after_backward().items():
-                print(f"step {step}: the {level} network is dead and begins anew, sub-seed {sub_seed}", file=sys.stderr)
-                self._record(step, revived=level, sub_seed=sub_seed)
+        if self.dead_network_reset is not None:
+            for network, sub_seed in self.dead_network_reset.after_backward().items():
+                message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
+                print(message, file=sys.stderr)
+                self._record(step, reinitialized=network, sub_seed=sub_seed)
         for weight, state in self.optimizer.state.items():
             if state["exp_avg"].shape != weight.shape:  # a table of features that has got more rows, or fewer
                 state.clear()
         self.optimizer.step()
+        self.scheduler.step()
         self.pipeline.datamanager.observe(torch.cat(errors))
         for callback in self.callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
@@ -150,11 +151,6 @@ class Trainer:
             part.backward()
             loss += part.detach()
         return loss
-
-    def learning_rate(self, step: int) -> float:
-        """lr * final_fraction^(step / planned steps)."""
-        optimizer = self.config.optimizer
-        return (optimizer.lr or 0.0) * optimizer.final_fraction ** (step / self.planned_steps)
 
     def save(self) -> None:
         """Write a checkpoint of the steps done so far.
@@ -173,15 +169,15 @@ class Trainer:
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "scheduler": self.scheduler.state_dict(),
+            "dead_network_reset": None if self.dead_network_reset is None else self.dead_network_reset.state_dict(),
             "sampler": self.pipeline.datamanager.state_dict(),
         }
-        if self.revival is not None:
-            state["revival"] = self.revival.state()
         save_checkpoint(self.run.checkpoints, self.next_step - 1, state)
 
-    def _log(self, step: int, loss: float) -> None:
+    def _log(self, step: int, loss: float, learning_rate: float) -> None:
         strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
-        self._record(step, loss=loss, learning_rate=self.learning_rate(step), strategy=strategy)
+        self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
 
     def _record(self, step: int, **values: Any) -> None:
         line = {"step": step, **values, "seconds": round(self.elapsed, 3)}
@@ -220,15 +216,15 @@ class Trainer:
                 signal.signal(number, handler)
 
 
-def adam(groups: list[list[torch.nn.Parameter]], config: OptimizerConfig) -> torch.optim.Adam:
-    """Adam over groups of weights; each step sets their learning rates."""
-    parts = [{"params": weights} for weights in groups]
+def create_adam(groups: list[tuple[list[torch.nn.Parameter], float]], config: OptimizerConfig) -> torch.optim.Adam:
+    """Adam over groups of weights, each with its learning rate as a multiple of the config's (which is resolved)."""
+    parts = [{"params": weights, "lr": (config.lr or 0.0) * scale} for weights, scale in groups]
     if config.fused:
         try:
-            return torch.optim.Adam(parts, 1.0, eps=config.eps, fused=True)
+            return torch.optim.Adam(parts, eps=config.eps, fused=True)
         except RuntimeError:  # before torch 2.4 a GPU's weights only
             pass
-    return torch.optim.Adam(parts, 1.0, eps=config.eps)
+    return torch.optim.Adam(parts, eps=config.eps)
 
 
 def choose_device(device_type: str) -> str:

@@ -93,7 +93,7 @@ class InfoNeRFModel(NeRFModel):
         loss, error = self.loss(outputs, batch)
         return loss + self._gain(rays, outputs), error
 
-    def unseen_loss(self, rays: RayBundle) -> Tensor:
+    def auxiliary_loss(self, rays: RayBundle) -> Tensor:
         """(n,) weighted ray entropy plus information gain of rays without an image."""
         outputs = self(rays)
         entropy = ray_entropy(_alpha(outputs), outputs["accumulation_fine"], self.config.entropy_threshold)

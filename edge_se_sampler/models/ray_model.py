@@ -19,6 +19,8 @@ class RayModel(nn.Module, ABC):
     """Renders rays; every network of it is one of `networks`, "fine" the one whose colours count."""
 
     networks: tuple[str, ...] = ("fine",)
+    num_unseen_rays = 0
+    """Rays a step, of cameras between the training views, that `auxiliary_loss` regularizes."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -103,6 +105,10 @@ class RayModel(nn.Module, ABC):
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """(n,) what training minimises the mean of on a batch's rays, and (n,) the fine colours' squared errors."""
         return self.loss(self(rays), batch)
+
+    def auxiliary_loss(self, rays: RayBundle) -> Tensor:
+        """(n,) loss of `num_unseen_rays` rays without pixels, whose mean training minimizes as well; 0 by default."""
+        return torch.zeros(len(rays), device=self.device)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """The loss of every ray, (n,), and the fine network's squared errors, (n,), detached.

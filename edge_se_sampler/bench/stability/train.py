@@ -131,7 +131,7 @@ def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
             trainer.train_iteration(step)
             if (step + 1) % max(1, scale.iterations // LOOKS) == 0:
                 shares.append(round(measured(model, pictures, stride=5)["fine"].share, 4))
-        revived = trainer.revival.used if trainer.revival is not None else 0
+        revived = 0 if trainer.dead_network_reset is None else trainer.dead_network_reset.used_sub_seeds
     told: dict[str, Any] = {}
     for level, shown in measured(model, pictures).items():
         told |= {f"{level}_ending": ending(shown, level in dead)}

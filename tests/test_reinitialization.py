@@ -1,4 +1,4 @@
-"""Dead networks: how they are told from living ones, and how they begin anew."""
+"""Dead networks: how they are detected, and how they are reinitialized."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.reinitialization import PATIENCE, dead_networks
+from edge_se_sampler.engine.reinitialization import PATIENCE, DeadNetworkReset, dead_networks
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
@@ -40,6 +40,11 @@ def trainer_of(
     return config.setup(run=RunFolder.create(config), pipeline=Pipeline.build(config, VIEWS, "cpu"), preview=None)
 
 
+def reset_of(trainer: Trainer) -> DeadNetworkReset:
+    assert trainer.dead_network_reset is not None
+    return trainer.dead_network_reset
+
+
 def kill(model: NeRFModel, *levels: str) -> None:
     with torch.no_grad():
         for level in levels:
@@ -51,7 +56,7 @@ def weights(model: NeRFModel, level: str) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("dead", [(), ("coarse",), ("fine",), ("coarse", "fine")])
-def test_the_dead_are_told_from_the_living(dead: tuple[str, ...], tmp_path: Path) -> None:
+def test_dead_networks_are_detected(dead: tuple[str, ...], tmp_path: Path) -> None:
     model = trainer_of(tmp_path).pipeline.model
     kill(model, *dead)
     rays = RayBundle(**{k: v for k, v in vars(tiny_rays(30, dtype=torch.float32)).items()})
@@ -59,24 +64,25 @@ def test_the_dead_are_told_from_the_living(dead: tuple[str, ...], tmp_path: Path
 
 
 @pytest.mark.parametrize("method", STRATEGIES)
-def test_networks_dead_at_the_start_begin_anew_under_every_strategy(method: str, tmp_path: Path, capsys: Any) -> None:
+def test_networks_dead_at_the_start_are_reinitialized_under_every_strategy(
+    method: str, tmp_path: Path, capsys: Any
+) -> None:
     trainer = trainer_of(tmp_path, method)
     kill(trainer.pipeline.model, "coarse", "fine")
     for step in range(PATIENCE + 20):
         trainer.train_iteration(step)
-    assert trainer.revival is not None
-    assert trainer.revival.used >= 2
-    assert dead_networks(trainer.pipeline.model, [trainer.revival.probe]) == []
-    assert "the coarse network is dead and begins anew, sub-seed 1" in capsys.readouterr().err
-    revived = [line for line in trainer.run.metrics() if "revived" in line]
-    assert [(line["step"], line["revived"], line["sub_seed"]) for line in revived[:2]] == [
+    assert reset_of(trainer).used_sub_seeds >= 2
+    assert dead_networks(trainer.pipeline.model, [reset_of(trainer).probe]) == []
+    assert "the coarse network is dead; reinitialized from sub-seed 1" in capsys.readouterr().err
+    logged = [line for line in trainer.run.metrics() if "reinitialized" in line]
+    assert [(line["step"], line["reinitialized"], line["sub_seed"]) for line in logged[:2]] == [
         (PATIENCE - 1, "coarse", 1),
         (PATIENCE - 1, "fine", 2),
     ]
 
 
 @pytest.mark.parametrize("dead", NeRFModel.networks)
-def test_only_the_dead_one_begins_anew(dead: str, tmp_path: Path) -> None:
+def test_only_the_dead_network_is_reinitialized(dead: str, tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path)
     model, (other,) = trainer.pipeline.model, [level for level in NeRFModel.networks if level != dead]
     kill(model, dead)
@@ -87,35 +93,33 @@ def test_only_the_dead_one_begins_anew(dead: str, tmp_path: Path) -> None:
     moved = {level: float((weights(model, level) - before[level]).abs().max()) for level in NeRFModel.networks}
     assert moved[dead] > 0.3  # new weights
     assert 0 < moved[other] < 0.05  # a step of training
-    assert trainer.revival is not None
-    assert trainer.revival.used == 1
+    assert reset_of(trainer).used_sub_seeds == 1
 
 
-def test_without_it_the_dead_stay_dead(tmp_path: Path) -> None:
+def test_without_reinit_dead_a_dead_network_stays_dead(tmp_path: Path) -> None:
     """The negative control, and what the faithful methods do."""
     trainer = trainer_of(tmp_path, "edge-se-nerf", reinit_dead=False)
     kill(trainer.pipeline.model, "coarse", "fine")
     before = weights(trainer.pipeline.model, "fine")
     for step in range(3 * PATIENCE):
         trainer.train_iteration(step)
-    assert trainer.revival is None
+    assert trainer.dead_network_reset is None
     torch.testing.assert_close(weights(trainer.pipeline.model, "fine"), before, rtol=0, atol=0)
 
 
-def test_the_living_are_left_alone(tmp_path: Path) -> None:
-    """Empty batches have no density gradient either; the probe tells."""
+def test_a_network_with_density_is_left_alone(tmp_path: Path) -> None:
+    """Batches without any gradient do not make it dead: the probe rays still meet density."""
     trainer, plain = trainer_of(tmp_path), trainer_of(tmp_path, reinit_dead=False)
     for step in range(2 * PATIENCE):
         assert trainer.train_iteration(step) == plain.train_iteration(step)
-    revival = trainer.revival
-    assert revival is not None
+    reset = reset_of(trainer)
     for _ in range(3 * PATIENCE):
         trainer.optimizer.zero_grad(set_to_none=False)
-        assert revival.after_backward() == {}
-    assert revival.used == 0
+        assert reset.after_backward() == {}
+    assert reset.used_sub_seeds == 0
 
 
-def test_a_revived_run_is_a_function_of_its_seed(tmp_path: Path) -> None:
+def test_a_run_with_reinitialization_is_a_function_of_its_seed(tmp_path: Path) -> None:
     def trained(seed: int) -> list[float]:
         trainer = trainer_of(tmp_path, seed=seed)
         kill(trainer.pipeline.model, "coarse", "fine")
@@ -125,7 +129,7 @@ def test_a_revived_run_is_a_function_of_its_seed(tmp_path: Path) -> None:
     assert trained(0) != trained(1)
 
 
-def test_new_weights_are_the_next_sub_seeds(tmp_path: Path) -> None:
+def test_a_second_reinitialization_draws_other_weights(tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path)
     model, found = trainer.pipeline.model, []
     for start in (0, PATIENCE):
@@ -133,13 +137,12 @@ def test_new_weights_are_the_next_sub_seeds(tmp_path: Path) -> None:
         for step in range(start, start + PATIENCE):
             trainer.train_iteration(step)
         found.append(weights(model, "fine"))
-    assert trainer.revival is not None
-    assert trainer.revival.used == 2
+    assert reset_of(trainer).used_sub_seeds == 2
     assert float((found[0] - found[1]).abs().max()) > 0.3
 
 
 @pytest.mark.parametrize("saved_after", [PATIENCE - 3, PATIENCE + 2])
-def test_a_checkpoint_remembers_silence_and_sub_seeds(saved_after: int, tmp_path: Path) -> None:
+def test_a_checkpoint_keeps_the_count_of_steps_and_of_sub_seeds(saved_after: int, tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path)
     kill(trainer.pipeline.model, "coarse", "fine")
     for step in range(saved_after):
@@ -152,21 +155,19 @@ def test_a_checkpoint_remembers_silence_and_sub_seeds(saved_after: int, tmp_path
     resumed.resume(load_checkpoint(latest_checkpoint(resumed.run.checkpoints), config_digest(resumed.config)))
     assert resumed.next_step == saved_after
     assert [resumed.train_iteration(step) for step in range(saved_after, saved_after + 12)] == went_on
-    assert resumed.revival.used == trainer.revival.used >= 2  # pyright: ignore[reportOptionalMemberAccess]
+    assert reset_of(resumed).used_sub_seeds == reset_of(trainer).used_sub_seeds >= 2
 
 
-def test_the_probe_sees_every_image(tmp_path: Path) -> None:
+def test_the_probe_rays_cover_every_image(tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path)
-    assert trainer.revival is not None
-    numbers = trainer.revival.probe.camera_indices[:, 0]
+    numbers = reset_of(trainer).probe.camera_indices[:, 0]
     assert np.unique(numbers.numpy()).tolist() == [0, 1, 2]
-    again = trainer_of(tmp_path).revival
-    assert again is not None
-    torch.testing.assert_close(again.probe.origins, trainer.revival.probe.origins)
+    again = reset_of(trainer_of(tmp_path))
+    torch.testing.assert_close(again.probe.origins, reset_of(trainer).probe.origins)
 
 
 @pytest.mark.parametrize("saved_after", [10, 30, 40])
-def test_a_checkpoint_remembers_what_auto_has_seen(
+def test_a_checkpoint_keeps_the_adaptive_schedules_state(
     saved_after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Saved in the early phase, in the late one, and in the early one that follows: all three are forced."""
