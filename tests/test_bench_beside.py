@@ -12,9 +12,7 @@ import pytest
 from edge_se_sampler.bench.baselines import run as beside
 from edge_se_sampler.bench.baselines.results import read_external
 from edge_se_sampler.bench.baselines.run import Clock, Scale, Task, TimeIsUp, mean_psnr, train
-from edge_se_sampler.bench.baselines.step import bench_step
 from edge_se_sampler.data.synthetic import make_scenes
-from edge_se_sampler.errors import InputError
 
 NERF_PYTORCH = """
 import sys, time
@@ -166,13 +164,3 @@ def test_the_program_that_asks_for_a_gpu_is_looked_at_without(
     )
     ((_, psnr),) = told["curve"]
     assert psnr == pytest.approx(mean_psnr([np.ones((24, 24, 3), np.float32)], made), abs=1e-3)
-
-
-def test_steps_are_taken_in_turn_and_timed(made: Path, tmp_path: Path) -> None:
-    told = bench_step(checkout(tmp_path / "theirs", "run_nerf.py", NERF_PYTORCH), made, 3, "tiny", 8)
-    assert {who: len(values) for who, values in told["seconds"].items()} == {"ours": 5, "theirs": 5}
-    assert 0.02 <= told["medians"]["theirs"] < 0.2  # it sleeps for 0.02 s
-    assert told["ratio"] == pytest.approx(told["medians"]["ours"] / told["medians"]["theirs"], rel=0.05)
-    wrong = checkout(tmp_path / "wrong", "run_nerf.py", "render_path = None\ndef train():\n    raise OSError\n")
-    with pytest.raises(InputError, match="nerf-pytorch does not train"):
-        bench_step(wrong, made, 1, "tiny", 8)

@@ -1,4 +1,4 @@
-"""What scoring costs and how it ranks: the arithmetic, and a small run of the command."""
+"""`bench scoring`, a small run: what each source of squared errors costs, and how it ranks."""
 
 from __future__ import annotations
 
@@ -6,38 +6,24 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-
-from edge_se_sampler.bench.micro.scoring import spearman
+from edge_se_sampler.bench.micro import command
 
 
-def test_ranks_correlate_whatever_the_scale() -> None:
-    rng = np.random.default_rng(0)
-    scores = rng.random(500)
-    assert spearman(scores, np.exp(5 * scores)) == pytest.approx(1)
-    assert spearman(scores, -scores) == pytest.approx(-1)
-    assert abs(spearman(scores, rng.random(500))) < 0.2
-
-
-def test_ties_share_their_rank() -> None:
-    # ranks 1, 2.5, 2.5, 4 against 1, 2, 3, 4: covariance 4.5, variances 4.5 and 5
-    assert spearman(np.array([0, 1, 1, 2]), np.arange(4)) == pytest.approx(4.5 / np.sqrt(4.5 * 5))
-
-
-def test_the_command_measures_all_three(scene: Path, tmp_path: Path, edge_se: Any) -> None:
-    (tmp_path / "w" / "scenes").mkdir(parents=True)
-    (tmp_path / "w" / "scenes" / "mic").symlink_to(scene)
-    out = tmp_path / "new" / "scoring.json"
-    answer = edge_se(
-        "bench", "scoring", "--output-path", out, "--workplace", tmp_path / "w", "--scene", "mic", "--size", "tiny",
-        "--rays", 64, "--rounds", 2, "--learning", 12,
-    )  # fmt: skip
+def test_the_command_compares_the_three_error_sources(
+    scene: Path, tmp_path: Path, edge_se: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr("edge_se_sampler.bench.scenes.cached_scene", lambda *_: scene)
+    assert command.BenchScoring(output_dir=tmp_path).file_name == "scoring-small"
+    flags = ["--scene", "mic", "--size", "tiny", "--rays", 64, "--rounds", 2, "--iterations", 12]
+    answer = edge_se("bench", "scoring", "--output-dir", tmp_path / "new", *flags)
     assert answer.code == 0, answer
-    told = json.loads(out.read_text())
-    assert set(told["time_against_random"]) == set(told["memory_against_random"]) == {"fine", "coarse", "cached"}
-    assert all(0.2 < ratio < 10 for ratio in told["time_against_random"].values())
-    assert told["rank_correlation_with_exact"]["coarse"] > 0.3
-    assert len(answer.out.splitlines()) == 4
-    assert edge_se("bench", "scoring", "--rounds", 0).code == 2
-    assert edge_se("bench", "scoring", "--scene", "lego").code == 2
+    result = json.loads((tmp_path / "new" / "scoring-tiny.json").read_text())
+    assert set(result["milliseconds"]) == {"random", "fine", "coarse", "cached"}
+    assert all(0.2 < ratio < 10 for ratio in result["memory_against_random"].values())
+    assert 0.3 < result["rank_correlation"]["coarse"] <= 1
+    assert f"{result['rank_correlation']['coarse']:.2f} |" in (tmp_path / "new" / "README.md").read_text()
+
+
+def test_values_without_meaning_are_refused(tmp_path: Path, edge_se: Any) -> None:
+    for flags in (("--rounds", 0), ("--scene", "lego", "--workplace", tmp_path)):
+        assert edge_se("bench", "scoring", "--output-dir", tmp_path / "new", *flags).code == 2

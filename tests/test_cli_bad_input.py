@@ -146,7 +146,7 @@ def test_an_output_folder_that_cannot_be_written(scene: Path, tmp_path: Path, ed
     [
         (("demo",), "--output-dir", "file"),
         (("bench", "chart"), "--output-dir", "file/below"),
-        (("bench", "samplers"), "--output-path", "file/result.json"),
+        (("bench", "samplers"), "--output-dir", "file/below"),
     ],
 )
 def test_results_that_could_not_be_kept_are_not_worked_for(command, flag: str, path: str, tmp_path: Path, edge_se):

@@ -436,3 +436,12 @@ def test_a_draw_leaves_its_arguments_alone() -> None:
     chosen = torch.tensor([5, 0, 2])
     table_of(*IMAGES).draw(chosen, 50, np.random.default_rng(0))
     assert chosen.tolist() == [5, 0, 2]
+
+
+def test_an_image_of_more_than_two_to_the_24_pixels() -> None:
+    """Its lower half is twice as strong; torch.multinomial drew nothing there at 2^24 categories."""
+    side, count = 4200, 100_000
+    strength = np.ones((side, side), dtype=np.float32)
+    strength[side // 2 :] = 2
+    in_lower_half = int((draws([strength], count)[:, 1] >= side // 2).sum())
+    assert p_value(np.array([count - in_lower_half, in_lower_half]), np.array([1 / 3, 2 / 3])) > ALPHA

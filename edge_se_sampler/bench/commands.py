@@ -8,74 +8,9 @@ from typing import Literal
 
 import tyro
 
-from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart, BenchStep
+from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart
+from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring, BenchStep
 from edge_se_sampler.errors import InputError, check_known
-
-
-@dataclass(frozen=True)
-class BenchSamplers:
-    """Time building tables, drawing and selecting pixels; compare the memory of SE with Random's."""
-
-    output_path: Path | None = None
-    """A json to write besides printing."""
-    images: int = 100
-    """Images in the tables."""
-    size: int = 800
-    """Rows and columns of an image."""
-    draws: int = 4096
-    """Pixels a draw."""
-    repeats: int = 200
-    """Rounds; the median of each kind of draw is reported."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.micro.samplers import bench_samplers, table_of
-        from edge_se_sampler.engine.files import make_room, write_json
-
-        if self.output_path is not None:
-            make_room(self.output_path)
-        if min(self.images, self.size, self.draws, self.repeats) < 1:
-            raise InputError("--images, --size, --draws and --repeats must be at least 1")
-        result = bench_samplers(self.images, self.size, self.draws, self.repeats)
-        print(table_of(result))
-        if self.output_path is not None:
-            write_json(self.output_path, result)
-
-
-@dataclass(frozen=True)
-class BenchScoring:
-    """Time and memory of squared errors scored exactly, by the coarse network, or remembered, against Random's; and
-    how well the cheap ones rank."""
-
-    output_path: Path | None = None
-    """A json to write besides printing."""
-    workplace: Path = Path("bench")
-    """Where the scene is kept."""
-    scene: str = "bricks"
-    """One of edge-se scenes."""
-    size: Literal["paper", "small", "tiny"] = "small"
-    """Of the dense networks."""
-    rays: int = 1024
-    """Of a step."""
-    rounds: int = 15
-    """Of timed steps, each scoring in turn; medians are reported."""
-    learning: int = 300
-    """Iterations before rankings are compared."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.micro.scoring import bench_scoring, scene_in, table_of
-        from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
-        from edge_se_sampler.engine.files import make_room, write_json
-
-        check_known("scene", (self.scene,), ANALOG_OF)
-        if min(self.rays, self.rounds, self.learning) < 1:
-            raise InputError("--rays, --rounds and --learning must be at least 1")
-        if self.output_path is not None:
-            make_room(self.output_path)
-        data = scene_in(self.workplace, self.scene)
-        result = bench_scoring(data, self.size, self.rays, self.rounds, self.learning)
-        print(table_of(result))
-        if self.output_path is not None:
-            write_json(self.output_path, result)
 
 
 @dataclass(frozen=True)

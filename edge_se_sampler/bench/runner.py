@@ -87,13 +87,18 @@ def load_or_create(path: Path, experiment: Experiment) -> dict[str, Any]:
     """
     settings = json.loads(json.dumps(asdict(experiment.settings)))
     if not path.exists():
-        command = shlex.join(["edge-se", *sys.argv[1:]])
-        head = {"version": VERSION, "experiment": experiment.name, "command": command, "settings": settings}
-        return head | {"machine": machine(), "errors": [], "runs": []}
+        return new_result(experiment.name, settings) | {"errors": [], "runs": []}
     result = read_result(path)
     if result["experiment"] != experiment.name or result["settings"] != settings:
         raise InputError(f"{path}: of another experiment or other settings; name another --output-dir, or move it away")
     return result
+
+
+def new_result(experiment: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """What every json of results begins with."""
+    command = shlex.join(["edge-se", *sys.argv[1:]])
+    head = {"version": VERSION, "experiment": experiment, "command": command}
+    return {**head, "settings": settings, "machine": machine()}
 
 
 def read_result(path: Path) -> dict[str, Any]:

@@ -128,34 +128,6 @@ class BenchBeside:
             print(f"{result['name']}, {run['scene']}, {run['seed']}: {psnr:.2f} dB after {seconds:.0f} s")
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchStep:
-    """Time the dense faithful step (1024 rays, 8 x 256, 64 + 128 samples) against nerf-pytorch's, in turn; leave a
-    json. Leave the machine alone."""
-
-    checkout: Path
-    """A git checkout of github.com/yenchenlin/nerf-pytorch."""
-    output_path: Path
-    """The json."""
-    workplace: Path = Path("bench")
-    """Where the scene is kept."""
-    rounds: int = 8
-    """Steps of each that count."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.baselines.step import bench_step
-        from edge_se_sampler.bench.micro.scoring import scene_in
-        from edge_se_sampler.engine.files import make_room, write_json
-
-        if self.rounds < 1:
-            raise InputError(f"--rounds is {self.rounds}: must be at least 1")
-        make_room(self.output_path)
-        result = bench_step(self.checkout, scene_in(self.workplace, "bricks"), self.rounds)
-        write_json(self.output_path, result)
-        seconds = result["medians"]
-        print(f"ours {seconds['ours']:.2f} s, theirs {seconds['theirs']:.2f} s: {result['ratio']:.2f} x")
-
-
 def _check_chosen(seeds: tuple[int, ...], scenes: tuple[str, ...], seconds: float, threads: int) -> None:
     if not (seeds and scenes):
         raise InputError("--seeds and --scenes: give at least one of each")
@@ -183,6 +155,6 @@ def _pixels(data: Path | None, scenes: tuple[str, ...]) -> int:
 
 def _folder(data: Path | None, workplace: Path, scene: str) -> Path:
     """A scene's, made if there are no --data."""
-    from edge_se_sampler.bench.micro.scoring import scene_in
+    from edge_se_sampler.bench.scenes import cached_scene
 
-    return scene_in(workplace, scene) if data is None else data / scene
+    return cached_scene(workplace, scene) if data is None else data / scene

@@ -1,144 +1,96 @@
-"""`edge-se bench scoring`: what squared errors cost, scored exactly, by the coarse network, or remembered, and how well
-the cheap ones rank pixels as the exact ones do.
+"""`edge-se bench scoring`: what squared errors cost, taken from the fine network, from the coarse one, or from a cache
+of earlier errors, and how well the cheap ones rank pixels as the fine ones do.
 
-Steps of the late phase are timed in turns within one process; peaks of memory in processes of their own.
+Steps of the late phase are timed in turns within one process; peaks of memory in a fresh process each.
 """
 
 from __future__ import annotations
 
-import statistics
 import tempfile
-import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.bench.micro.samplers import peak_bytes
-from edge_se_sampler.data.synthetic.folder import make_scenes
-from edge_se_sampler.engine.config import MachineConfig
+from edge_se_sampler.bench.micro.samplers import late_phase, training_peak
+from edge_se_sampler.bench.overrides import override
+from edge_se_sampler.bench.statistics import rank_correlation, require_scipy_stats
+from edge_se_sampler.bench.timing import medians, time_interleaved
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 
-SCORINGS = ("fine", "coarse", "cached")
-COMPARED = 4096
+ERROR_SOURCES = ("fine", "coarse", "cached")
+NUM_RANKED = 4096
 """Pixels whose scores are ranked."""
 
 
-def bench_scoring(data: Path, size: str, rays: int, rounds: int, learning: int) -> dict[str, Any]:
+def measure_scoring(data: Path, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
     """Measure on a Blender folder.
 
     Args:
-        data: a scene.
-        size: of the dense networks.
-        rays: of a step.
-        rounds: of timed steps; medians are reported.
-        learning: iterations before rankings are compared.
+        size: of the networks, as `--pipeline.model.size`.
+        rays: pixels per step.
+        rounds: timed steps of each.
+        iterations: of training before rankings are compared.
+
+    Returns:
+        `milliseconds` per step of Random and of each error source, `memory_against_random` of each error source (a
+        ratio of peaks), and `rank_correlation` of the cheap scores with the fine ones (Spearman).
+
+    Raises:
+        InputError: the folder is no scene, or the [bench] extra is missing.
     """
+    require_scipy_stats()
+    methods = {"random": ("vanilla-nerf", "fine"), **{source: ("se-nerf", source) for source in ERROR_SOURCES}}
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
-        trainers = {"random": _trainer("vanilla-nerf", "fine", data, place, size, rays)}
-        trainers |= {how: _trainer("se-nerf", how, data, place, size, rays) for how in SCORINGS}
-        times = _timed(trainers, rounds)
-        learnt = _trainer("se-nerf", "cached", data, place, size, rays)
-        progress = Progress(learning, "learning")
-        for step in range(learning):
-            learnt.train_iteration(step)
+
+        def build_trainer(method: str, error_source: str) -> Trainer:
+            config = method_configs()[method]
+            changes = {"data": data, "output_dir": Path(folder), "machine.device_type": "cpu"}
+            return prepare(override(config, changes | late_phase(rays, size, error_source)))
+
+        trainers = {name: build_trainer(*method) for name, method in methods.items()}
+        seconds = time_interleaved({name: trainer.train_iteration for name, trainer in trainers.items()}, rounds)
+        trainer = build_trainer("se-nerf", "cached")
+        progress = Progress(iterations, "training")
+        for step in range(iterations):
+            trainer.train_iteration(step)
             progress.update(step + 1)
         progress.close()
-        ranks = rankings(learnt, learning)
-    peaks = {name: peak_bytes("vanilla-nerf" if name == "random" else "se-nerf", rays, size, name) for name in trainers}
+        correlations = correlate_rankings(trainer, iterations)
+    peaks = {name: training_peak(method, rays, size, source) for name, (method, source) in methods.items()}
     return {
-        "size": size,
-        "rays": rays,
-        "rounds": rounds,
-        "learning": learning,
-        "milliseconds": {name: 1e3 * value for name, value in times.items()},
-        "time_against_random": {name: times[name] / times["random"] for name in SCORINGS},
-        "memory_against_random": {name: peaks[name] / peaks["random"] for name in SCORINGS},
-        "rank_correlation_with_exact": ranks,
-        "machine": machine(),
+        "milliseconds": {name: 1e3 * value for name, value in medians(seconds).items()},
+        "memory_against_random": {source: peaks[source] / peaks["random"] for source in ERROR_SOURCES},
+        "rank_correlation": correlations,
     }
 
 
-def _trainer(method: str, scoring: str, data: Path, place: Path, size: str, rays: int) -> Trainer:
-    """A dense training whose late phase begins at once."""
-    config = method_configs()[method]
-    manager = config.pipeline.datamanager
-    sampler = replace(manager.pixel_sampler, early_fraction=0.0, error_source=scoring)
-    manager = replace(manager, train_num_rays_per_batch=rays, pixel_sampler=sampler)
-    pipeline = replace(config.pipeline, datamanager=manager, model=replace(config.pipeline.model, size=size))
-    return prepare(
-        replace(config, data=data, output_dir=place, pipeline=pipeline, machine=MachineConfig(device_type="cpu"))
-    )
+def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
+    """Spearman's correlation of coarse and cached scores with the fine ones, over pixels drawn uniformly.
 
-
-def _timed(trainers: dict[str, Trainer], rounds: int) -> dict[str, float]:
-    """Median seconds of a step of each, taken in turns; the first round does not count."""
-    times: dict[str, list[float]] = {name: [] for name in trainers}
-    progress = Progress(rounds + 1, "timing")
-    for step in range(rounds + 1):
-        for name, trainer in trainers.items():
-            began = time.perf_counter()
-            trainer.train_iteration(step)
-            times[name].append(time.perf_counter() - began)
-        progress.update(step + 1)
-    progress.close()
-    return {name: statistics.median(values[1:]) for name, values in times.items()}
-
-
-def rankings(trainer: Trainer, step: int) -> dict[str, float]:
-    """Spearman's correlation of cheap scores with the exact ones, over pixels drawn uniformly from all images."""
+    Args:
+        trainer: whose pixel sampler caches errors.
+        step: that the cached errors are looked up at.
+    """
     manager, model = trainer.pipeline.datamanager, trainer.pipeline.model
-    memory = manager.train_pixel_sampler.memory
-    images = manager.image_batch["image"]
+    sampler, images = manager.train_pixel_sampler, manager.image_batch["image"]
     rng = np.random.default_rng(0)
-    numbers = rng.integers(len(images), size=COMPARED)
+    numbers = rng.integers(len(images), size=NUM_RANKED)
     pixels = [(n, *rng.integers(images[n].shape[:2])) for n in numbers.tolist()]
     indices = torch.tensor(pixels)
     rays = manager.cameras.pixel_rays(indices)
     image = torch.stack([images[n][row, column] for n, row, column in pixels]).float() / 255
-    scores: dict[str, list[torch.Tensor]] = {"fine": [], "coarse": []}
+    errors: dict[str, list[torch.Tensor]] = {"fine": [], "coarse": []}
     model.eval()
     with torch.no_grad():
         for rows in model.chunks(len(rays)):
             outputs = model(rays[rows])
-            for level, told in scores.items():
-                told.append(model.squared_error(outputs, image[rows], level))
-    exact, coarse = (torch.cat(told).numpy() for told in scores.values())
-    remembered = memory.recall(indices.numpy(), step, manager.train_pixel_sampler.num_rays_per_batch)
-    return {"coarse": spearman(exact, coarse), "cached": spearman(exact, remembered)}
-
-
-def spearman(first: np.ndarray, second: np.ndarray) -> float:
-    """Correlation of the ranks of two sets of scores; ties share their mean rank."""
-    ranks = []
-    for scores in (first, second):
-        _, place, count = np.unique(scores, return_inverse=True, return_counts=True)
-        ranks.append((count.cumsum() - (count - 1) / 2)[place])
-    return float(np.corrcoef(np.stack(ranks))[0, 1])
-
-
-def scene_in(workplace: Path, scene: str) -> Path:
-    """A synthetic scene, made if it is not there."""
-    data = workplace / "scenes" / scene
-    if not data.exists():
-        make_scenes(data.parent, [scene])
-    return data
-
-
-def table_of(result: dict[str, Any]) -> str:
-    """The result as lines to read."""
-    times, memory, ranks = (
-        result[key] for key in ("time_against_random", "memory_against_random", "rank_correlation_with_exact")
-    )
-    lines = [f"{result['size']} networks, {result['rays']} rays, against Random's step"]
-    for name in SCORINGS:
-        rank = f", ranks as exact scores do: {ranks[name]:.2f}" if name in ranks else ""
-        lines.append(f"  {name:<7} {times[name]:.2f} x the time, {memory[name]:.2f} x the memory{rank}")
-    return "\n".join(lines)
+            for level, of_level in errors.items():
+                of_level.append(model.squared_error(outputs, image[rows], level))
+    fine, coarse = (torch.cat(of_level).numpy() for of_level in errors.values())
+    cached = sampler.memory.recall(indices.numpy(), step, sampler.num_rays_per_batch)
+    return {"coarse": rank_correlation(fine, coarse), "cached": rank_correlation(fine, cached)}
