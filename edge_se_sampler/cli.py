@@ -68,9 +68,8 @@ class Scenes:
         from edge_se_sampler.data.synthetic.folder import make_scenes
         from edge_se_sampler.engine.progress import Progress
 
-        progress = Progress(len(self.names) * (self.num_train + self.num_val + self.num_test), "rendering scenes")
-        try:
-            made = make_scenes(
+        with Progress(0, "rendering scenes") as progress:
+            paths = make_scenes(
                 self.out,
                 self.names,
                 size=self.size,
@@ -80,11 +79,9 @@ class Scenes:
                 placement=self.placement,
                 offset=self.offset,
                 seed=self.seed,
-                progress=lambda done, _: progress.update(done),
+                progress=progress.update,
             )
-        finally:
-            progress.close()
-        for path in made:
+        for path in paths:
             print(path)
 
 
@@ -105,17 +102,9 @@ class Offcenter:
         from edge_se_sampler.data.offcenter import offcenter
         from edge_se_sampler.engine.progress import Progress
 
-        progress = Progress(0, "padding views")
-
-        def show(done: int, total: int) -> None:
-            progress.total = total
-            progress.update(done)
-
-        try:
-            made = offcenter(self.data, self.out, self.shift, self.pad, show)
-        finally:
-            progress.close()
-        for path in made:
+        with Progress(0, "moving views off the center") as progress:
+            paths = offcenter(self.data, self.out, self.shift, self.pad, progress.update)
+        for path in paths:
             print(path)
 
 

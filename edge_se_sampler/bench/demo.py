@@ -67,12 +67,11 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
 
 def make_demo_scene(folder: Path) -> Path:
     """The demo's Blender folder, made in `folder`."""
-    progress = Progress(50 + 1 + 10, f"making {SCENE}, off centre")
-    (scene,) = make_scenes(
-        folder, [SCENE], size=SIZE, num_train=50, num_val=1, num_test=10, placement="shifted", offset=OFFSET,
-        progress=lambda done, _: progress.update(done),
-    )  # fmt: skip
-    progress.close()
+    with Progress(0, f"rendering {SCENE}, off center") as progress:
+        (scene,) = make_scenes(
+            folder, [SCENE], size=SIZE, num_train=50, num_val=1, num_test=10, placement="shifted", offset=OFFSET,
+            progress=progress.update,
+        )  # fmt: skip
     return scene
 
 

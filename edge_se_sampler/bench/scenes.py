@@ -22,12 +22,6 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
     words = [f"{key}-{value}" for key, value in sorted(options.items()) if key != "progress"]
     folder = workplace / "scenes" / ("_".join(words) or "default")
     if not (folder / name).exists():
-        progress = Progress(0, f"rendering {name}")
-
-        def update(done: int, total: int) -> None:
-            progress.total = total
-            progress.update(done)
-
-        make_scenes(folder, [name], progress=update, **options)
-        progress.close()
+        with Progress(0, f"rendering {name}") as progress:
+            make_scenes(folder, [name], progress=progress.update, **options)
     return folder / name

@@ -1,49 +1,61 @@
-"""One line on the terminal that tells how far a long job is; silent where there is no terminal."""
+"""How far a long job is: tqdm's bar on a terminal; where stderr is a file or a pipe, now and then a line."""
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
+from collections.abc import Callable
+from typing import Any
+
+from tqdm import tqdm
+
+SECONDS_PER_LINE = 30
+LINE = "{desc}: {n_fmt}/{total_fmt}, {percentage:.0f} %, {remaining} left{postfix}"
 
 
 class Progress:
-    """A line that is written over, at most five times a second.
+    """Shows on stderr what part of a job is done and how long the rest will take. A context manager.
 
     Args:
-        total: steps of the whole job.
-        start: steps done in an earlier session.
+        total: steps of the whole job; 0 where `update` will tell.
         label: what is being done.
+        start: steps done in an earlier session.
+        clock: seconds, for the lines of a log.
     """
 
-    def __init__(self, total: int, label: str, start: int = 0) -> None:
-        self.total, self.label, self.start = total, label, start
-        self.live = sys.stderr.isatty()
-        self._began = time.monotonic()
-        self._shown = 0.0
+    def __init__(self, total: int, label: str, start: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+        self.total, self.label, self.start, self._clock = total, label, start, clock
+        # disabled where stderr is no terminal
+        self._bar = tqdm(total=total, desc=label, initial=start, leave=False, dynamic_ncols=True, disable=None)
+        self._began = self._last_line = self._last_update = clock()
 
-    def update(self, done: int, note: str = "") -> None:
-        """Show that `done` of `total` steps are finished."""
-        now = time.monotonic()
-        if not self.live or (now - self._shown < 0.2 and done < self.total):
+    def update(self, done: int, total: int | None = None, note: str = "") -> None:
+        """Tell that `done` of `total` steps are finished."""
+        self.total = self.total if total is None else total
+        if not self._bar.disable:
+            self._bar.total = self.total
+            self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(done - self._bar.n)
             return
-        self._shown = now
-        elapsed = now - self._began
-        left = elapsed / max(done - self.start, 1) * (self.total - done)
-        text = f"{self.label}  {done}/{self.total}  {100 * done / max(self.total, 1):.0f} %  {clock(left)} left  {note}"
-        width = shutil.get_terminal_size().columns - 1
-        sys.stderr.write("\r" + text[:width].ljust(width))
-        sys.stderr.flush()
+        now = self._clock()
+        next_update, self._last_update = now + (now - self._last_update), now
+        if self.total and next_update - self._last_line > SECONDS_PER_LINE:
+            self._last_line = now
+            seconds = now - self._began
+            print(
+                tqdm.format_meter(
+                    done, self.total, seconds, prefix=self.label, postfix=note, initial=self.start, bar_format=LINE
+                ),
+                file=sys.stderr,
+                flush=True,
+            )
 
     def close(self) -> None:
-        """Clear the line."""
-        if self.live and self._shown:
-            sys.stderr.write("\r" + " " * (shutil.get_terminal_size().columns - 1) + "\r")
-            sys.stderr.flush()
+        """Remove the bar."""
+        self._bar.close()
 
+    def __enter__(self) -> Progress:
+        return self
 
-def clock(seconds: float) -> str:
-    """Seconds as h:mm:ss or m:ss."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+    def __exit__(self, *_: Any) -> None:
+        self.close()

@@ -38,16 +38,15 @@ def evaluate_run(
     pictures = test_pictures(config)
     if render_output_path is not None:
         make_folder(render_output_path, "--render-output-path")
-    progress = Progress(len(pictures), "evaluating")
 
-    def each(i: int, picture: Picture, rendered: np.ndarray) -> None:
+    def report(i: int, picture: Picture, rendered: np.ndarray) -> None:
         progress.update(i + 1)
         if render_output_path is not None:
             pair = np.concatenate((composite_on(picture.image, get_background_color(model)), rendered), axis=1)
             write_image(render_output_path / f"{i:04d}.png", pair)
 
-    results = evaluate(model, pictures, each)
-    progress.close()
+    with Progress(len(pictures), "evaluating") as progress:
+        results = evaluate(model, pictures, report)
     content = {
         "experiment_name": config.experiment_name,
         "method_name": config.method_name,
@@ -75,13 +74,12 @@ def render_run(
         train = read_views(config)
         cameras = spiral(train.cameras, num_frames)
         pictures = [Picture(f"{i}", unit_float(train.images[0]), cameras[[i]]) for i in range(num_frames)]
-    progress = Progress(len(pictures), "rendering")
     frames = []
-    for i, picture in enumerate(pictures):
-        rendered = render_rays(model, picture.rays(model.device))
-        frames.append(rendered.reshape(*picture.image.shape[:2], 3).numpy())
-        progress.update(i + 1)
-    progress.close()
+    with Progress(len(pictures), "rendering") as progress:
+        for i, picture in enumerate(pictures):
+            rendered = render_rays(model, picture.rays(model.device))
+            frames.append(rendered.reshape(*picture.image.shape[:2], 3).numpy())
+            progress.update(i + 1)
     if len({frame.shape for frame in frames}) > 1:
         raise InputError("the held-out views differ in size and make no video; use --kind spiral")
     write_video(output_path, frames, frames_per_second)

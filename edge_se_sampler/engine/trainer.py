@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch.optim.lr_scheduler import LambdaLR
+from tqdm import tqdm
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
@@ -79,10 +80,9 @@ class Trainer:
             InputError: something cannot be written.
         """
         config = self.config
-        progress = Progress(self.planned_steps, config.method_name, self.next_step)
         began = time.monotonic() - self.elapsed
         deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds
-        with self._interruptible():
+        with self._interruptible(), Progress(self.planned_steps, config.method_name, self.next_step) as progress:
             while self.next_step < self.planned_steps:
                 step = self.next_step
                 learning_rate = float(self.scheduler.get_last_lr()[0])
@@ -97,10 +97,9 @@ class Trainer:
                     began = time.monotonic() - self.elapsed  # looking is not training
                 if stop or self.next_step % config.steps_per_save == 0:
                     self.save()
-                progress.update(self.next_step, self._note(loss))
+                progress.update(self.next_step, note=self._note(loss))
                 if stop:
                     break
-        progress.close()
         self.events.close()
 
     def train_iteration(self, step: int) -> float:
@@ -131,7 +130,7 @@ class Trainer:
         if self.dead_network_reset is not None:
             for network, sub_seed in self.dead_network_reset.after_backward().items():
                 message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
-                print(message, file=sys.stderr)
+                tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
                 self._record(step, reinitialized=network, sub_seed=sub_seed)
         for weight, state in self.optimizer.state.items():
             if state["exp_avg"].shape != weight.shape:  # a table of features that has got more rows, or fewer
@@ -194,8 +193,8 @@ class Trainer:
 
     def _note(self, loss: float) -> str:
         rate = self.next_step * (self.config.pipeline.datamanager.train_num_rays_per_batch or 0) / self.elapsed
-        psnr = "" if self._preview_psnr is None else f"  PSNR {self._preview_psnr:.2f}"
-        return f"{rate:,.0f} rays/s  loss {loss:.5f}{psnr}"
+        psnr = "" if self._preview_psnr is None else f", PSNR {self._preview_psnr:.2f}"
+        return f"{rate:,.0f} rays/s, loss {loss:.5f}{psnr}"
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
