@@ -59,9 +59,9 @@ def write_json(folder: Path, doc: object, split: str = "train") -> None:
     (folder / f"transforms_{split}.json").write_text(json.dumps(doc), encoding="utf-8")
 
 
-def png(width: int, height: int, depth: int, colour: int, rows: bytes, extra: bytes = b"") -> bytes:
-    """A PNG written by hand, for what imageio does not write: `colour` is 0 grey, 2 RGB, 3 palette, 6 RGBA."""
-    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+def png(width: int, height: int, depth: int, color: int, rows: bytes, extra: bytes = b"") -> bytes:
+    """A PNG written by hand, for what imageio does not write: `color` is 0 gray, 2 RGB, 3 palette, 6 RGBA."""
+    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
     end = chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + extra + end
 

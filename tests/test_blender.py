@@ -41,7 +41,7 @@ def test_pixels_names_and_poses_are_those_on_disk(tmp_path: Path, doc: dict[str,
     assert views.masks is None
     for i, image in enumerate(views.images):
         assert image.dtype == np.uint8
-        np.testing.assert_array_equal(image, pixels(i))  # alpha straight: colours under alpha 0 too
+        np.testing.assert_array_equal(image, pixels(i))  # alpha straight: colors under alpha 0 too
     assert views.cameras.camera_to_worlds.dtype == torch.float64
     expected = [frame["transform_matrix"][:3] for frame in doc["frames"]]
     np.testing.assert_array_equal(views.cameras.camera_to_worlds, expected)  # every bit of the doubles
@@ -90,11 +90,11 @@ def test_sizes_may_differ_where_frames_state_them(tmp_path: Path, doc: dict[str,
 
 
 def test_masks_are_true_where_not_black_and_whole_where_missing(tmp_path: Path, doc: dict[str, Any]) -> None:
-    grey = np.zeros((HEIGHT, WIDTH), np.uint8)
-    grey[1, 2], grey[0, 0] = 255, 1
+    gray = np.zeros((HEIGHT, WIDTH), np.uint8)
+    gray[1, 2], gray[0, 0] = 255, 1
     opaque = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     opaque[..., 3] = 255  # black all over
-    iio.imwrite(tmp_path / "m_0.png", grey)
+    iio.imwrite(tmp_path / "m_0.png", gray)
     iio.imwrite(tmp_path / "m_1.png", opaque)
     for i in range(2):
         doc["frames"][i]["mask_path"] = f"m_{i}.png"
@@ -102,7 +102,7 @@ def test_masks_are_true_where_not_black_and_whole_where_missing(tmp_path: Path, 
     masks = read_blender(tmp_path, "train").masks
     assert masks is not None
     assert all(mask.dtype == bool for mask in masks)
-    np.testing.assert_array_equal(masks[0], grey != 0)
+    np.testing.assert_array_equal(masks[0], gray != 0)
     assert not masks[1].any()
     assert masks[2].shape == (HEIGHT, WIDTH)
     assert masks[2].all()
@@ -115,7 +115,7 @@ def one_view(folder: Path, data: bytes) -> np.ndarray:
     return read_blender(folder, "train").images[0]
 
 
-PALETTE = chunk(b"PLTE", bytes([10, 20, 30, 40, 50, 60]))  # colours 0 and 1
+PALETTE = chunk(b"PLTE", bytes([10, 20, 30, 40, 50, 60]))  # colors 0 and 1
 RGB_ROW = b"\0\1\2\3\4\5\6"  # the filter, then two pixels
 TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
 
@@ -123,9 +123,9 @@ TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
 @pytest.mark.parametrize(
     ("data", "expected"),
     [
-        pytest.param(png(2, 1, 8, 0, b"\0\x07\xff"), [[[7] * 3, [255] * 3]], id="grey"),
+        pytest.param(png(2, 1, 8, 0, b"\0\x07\xff"), [[[7] * 3, [255] * 3]], id="gray"),
         pytest.param(png(2, 1, 1, 0, b"\0\x40"), [[[0] * 3, [255] * 3]], id="one bit"),
-        pytest.param(png(2, 1, 8, 4, b"\0\x07\x08\x09\x0a"), [[[7, 7, 7, 8], [9, 9, 9, 10]]], id="grey and alpha"),
+        pytest.param(png(2, 1, 8, 4, b"\0\x07\x08\x09\x0a"), [[[7, 7, 7, 8], [9, 9, 9, 10]]], id="gray and alpha"),
         pytest.param(png(2, 1, 8, 3, b"\0\0\1", PALETTE), TWO_COLOURS, id="palette"),
         pytest.param(png(2, 1, 1, 3, b"\0\x40", PALETTE), TWO_COLOURS, id="palette of one bit"),
         pytest.param(
@@ -136,7 +136,7 @@ TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
         pytest.param(
             png(2, 1, 8, 2, RGB_ROW, chunk(b"tRNS", b"\0\1\0\2\0\3")),
             [[[1, 2, 3, 0], [4, 5, 6, 255]]],
-            id="one transparent colour",
+            id="one transparent color",
         ),
         pytest.param(png(2, 1, 8, 2, RGB_ROW, chunk(b"gAMA", b"\0\0\0\x64")), [[[1, 2, 3], [4, 5, 6]]], id="gamma"),
         pytest.param(png(2, 1, 8, 2, RGB_ROW) + b"more", [[[1, 2, 3], [4, 5, 6]]], id="bytes after the end"),
@@ -197,7 +197,7 @@ def test_lens_distortion_is_refused_unless_it_is_none(place: str, tmp_path: Path
     assert len(read_blender(tmp_path, "test").images) == 3
     parent["k1"] = 0.3
     write_json(tmp_path, doc, "test")
-    with pytest.raises(InputError, match=r"k1: is 0\.3, but rays here know no lens distortion"):
+    with pytest.raises(InputError, match=r"k1: is 0\.3, but lens distortion is not supported"):
         read_blender(tmp_path, "test")
 
 

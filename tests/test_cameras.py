@@ -159,7 +159,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def test_a_shifted_scene_has_the_rays_of_the_centred_one(folders: dict[str, Path]) -> None:
-    """Pixels pasted (12, 4) right and up of the corner: same colours, same rays, so nothing but the place differs."""
+    """Pixels pasted (12, 4) right and up of the corner: same colors, same rays, so nothing but the place differs."""
     centred, shifted = (read_blender(folders[name], "train") for name in ("centered", "shifted"))
     top, left = 20 - 12 - 4, 20 - 12 + 8
     for view in range(3):
@@ -174,7 +174,7 @@ def test_a_shifted_scene_has_the_rays_of_the_centred_one(folders: dict[str, Path
 
 @pytest.mark.parametrize("placement", ["centered", "shifted", "rotated"])
 def test_rays_meet_the_scene_where_its_pictures_show_it(folders: dict[str, Path], placement: str) -> None:
-    """A pixel's alpha is the share of 16 rays that hit; the ray of its centre must agree where all or none do."""
+    """A pixel's alpha is the share of 16 rays that hit; the ray of its center must agree where all or none do."""
     views = read_blender(folders[placement], "train")
     scene = synthetic_scene("bricks")
     for view in range(3):

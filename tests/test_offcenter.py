@@ -1,4 +1,4 @@
-"""Off-centre counterparts of a folder: nothing but the place differs, and the json says so."""
+"""Off-center copies of a folder: nothing but the position differs, and the json says so."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.errors import InputError
 
-TWINS = ("centered", "shifted")
+COPIES = ("centered", "shifted")
 SHIFT = (0.4, -0.3)  # 2 pixels right, 1 up, of 6 x 4; padded as much, the canvas is 10 x 6
 WHITE = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
 
@@ -31,14 +31,14 @@ def read_json(folder: Path, split: str = "train") -> dict[str, Any]:
 
 
 def on_canvas(picture: np.ndarray, columns: int, rows: int, x: int, y: int, around: int = 0) -> np.ndarray:
-    """What a twin should show: (H', W', ...) with the picture's corner at (x, y)."""
+    """What a copy should show: (H', W', ...) with the picture's corner at (x, y)."""
     canvas = np.full((rows, columns, *picture.shape[2:]), around, np.uint8)
     canvas[y : y + len(picture), x : x + picture.shape[1]] = picture
     return canvas
 
 
-def twins_of(data: Path) -> list[tuple[Path, tuple[int, int]]]:
-    """Both twins of a 6 x 4 scene under SHIFT, and the corner of the pictures in each."""
+def copies_of(data: Path) -> list[tuple[Path, tuple[int, int]]]:
+    """Both copies of a 6 x 4 scene under SHIFT, and the corner of the pictures in each."""
     return list(zip(offcenter(data, data.with_name("out"), SHIFT), ((2, 1), (4, 0)), strict=True))
 
 
@@ -67,7 +67,7 @@ class TestPixels:
         for split in SPLITS:
             write_scene(tmp_path / "scene", split=split)
         made = offcenter(tmp_path / "scene", tmp_path / "out", shift, pad)
-        assert made == [tmp_path / "out" / twin for twin in TWINS]
+        assert made == [tmp_path / "out" / copy for copy in COPIES]
         for folder, corner in zip(made, corners, strict=True):
             for split in SPLITS:
                 for i in range(3):
@@ -81,12 +81,12 @@ class TestPixels:
         found = iio.imread(shifted / "train/r_0.png")
         np.testing.assert_array_equal(found, on_canvas(pixels(0, 20, 20), 28, 26, 8, 6), strict=True)
 
-    def test_rgb_is_padded_with_the_colour_of_its_border(self, tmp_path: Path) -> None:
+    def test_rgb_is_padded_with_the_color_of_its_border(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene", n=1)
         picture = WHITE.copy()
         picture[1:3, 2:5] = pixels(0)[1:3, 2:5, :3]
         iio.imwrite(tmp_path / "scene/train/r_0.png", picture)
-        for folder, corner in twins_of(tmp_path / "scene"):
+        for folder, corner in copies_of(tmp_path / "scene"):
             expected = on_canvas(picture, 10, 6, *corner, around=255)
             np.testing.assert_array_equal(iio.imread(folder / "train/r_0.png"), expected, strict=True)
 
@@ -109,35 +109,35 @@ class TestPixels:
         for i in range(2):
             doc["frames"][i]["mask_path"] = "m"  # shared
         write_json(tmp_path / "scene", doc)
-        for folder, corner in twins_of(tmp_path / "scene"):
+        for folder, corner in copies_of(tmp_path / "scene"):
             masks = read_blender(folder, "train").masks
             assert masks is not None
             for i in range(2):
                 np.testing.assert_array_equal(masks[i], on_canvas(mask, 10, 6, *corner) > 0)
             assert masks[2].all()  # of a frame that has none all counts, as before
-            assert iio.imread(folder / "m.png").shape == (6, 10)  # grey, as other hosts want it
+            assert iio.imread(folder / "m.png").shape == (6, 10)  # gray, as other hosts want it
 
 
 class TestCameras:
     @pytest.fixture
     def folders(self, tmp_path: Path) -> list[Path]:
-        """A synthetic scene, its centred and its shifted twin."""
+        """A synthetic scene, its centered and its shifted copy."""
         made = make_scenes(tmp_path, ["mic"], size=20, num_train=2, num_val=1, num_test=1, placement="centered")
         return [*made, *offcenter(made[0], tmp_path / "out")]
 
     @staticmethod
     def seen(picture: Picture, corner: tuple[int, int]) -> dict[str, np.ndarray]:
-        """Origins, directions and colours of the 20 x 20 pixels at a corner."""
+        """Origins, directions and colors of the 20 x 20 pixels at a corner."""
         rays = picture.rays(torch.device("cpu"))
         x, y = corner
         height, width = picture.image.shape[:2]
-        flat = {"origins": rays.origins.numpy(), "directions": rays.directions.numpy(), "colours": picture.image}
+        flat = {"origins": rays.origins.numpy(), "directions": rays.directions.numpy(), "colors": picture.image}
         return {k: v.reshape(height, width, -1)[y : y + 20, x : x + 20] for k, v in flat.items()}
 
     @pytest.mark.parametrize("split", SPLITS)
-    def test_every_pixel_keeps_its_ray_and_its_colour(self, split: Split, folders: list[Path]) -> None:
-        source, *twins = [pictures_of(read_blender(folder, split)) for folder in folders]
-        for pictures, corner in zip(twins, ((4, 3), (8, 6)), strict=True):
+    def test_every_pixel_keeps_its_ray_and_its_color(self, split: Split, folders: list[Path]) -> None:
+        source, *copies = [pictures_of(read_blender(folder, split)) for folder in folders]
+        for pictures, corner in zip(copies, ((4, 3), (8, 6)), strict=True):
             for before, after in zip(source, pictures, strict=True):
                 assert after.image.shape == (26, 28, 4)
                 expected, found = self.seen(before, (0, 0)), self.seen(after, corner)
@@ -167,7 +167,7 @@ class TestCameras:
         doc["frames"][1] |= {"fl_x": 20.25, "cy": 1.75}
         doc["frames"][2] |= {"fl_y": 11.5, "cx": 2.5, "w": WIDTH}  # no other than the file's
         write_json(tmp_path / "scene", doc)
-        for folder, corner in twins_of(tmp_path / "scene"):
+        for folder, corner in copies_of(tmp_path / "scene"):
             views = read_blender(folder, "train")
             np.testing.assert_array_equal(focal_lengths(views), [[10.1, 11.5], [20.25, 11.5], [10.1, 11.5]])
             np.testing.assert_array_equal(principal_points(views) - corner, [[2.5, 2], [2.5, 1.75], [2.5, 2]])
@@ -275,13 +275,13 @@ class TestClipping:
             assert "would lose" in refusal(tmp_path / "scene", tmp_path / "out", shift=SHIFT, pad=less)
         offcenter(tmp_path / "scene", tmp_path / "out", SHIFT, (0.333333, 0.25))
 
-    def test_in_rgb_other_colours_than_the_borders_are_the_object(self, tmp_path: Path) -> None:
+    def test_in_rgb_other_colors_than_the_borders_are_the_object(self, tmp_path: Path) -> None:
         self.scene(tmp_path / "scene", np.s_[1:3, 1:5], channels=3)
         line = refusal(tmp_path / "scene", tmp_path / "out", shift=SHIFT, pad=(0, 0))
         assert "would lose 2 pixels" in line
         assert "--pad 0.166667 0, or" in line
 
-    def test_faint_pixels_count_and_colours_without_alpha_do_not(self, tmp_path: Path) -> None:
+    def test_faint_pixels_count_and_colors_without_alpha_do_not(self, tmp_path: Path) -> None:
         self.scene(tmp_path / "scene", np.s_[1:3, 1:4])
         picture = iio.imread(tmp_path / "scene/train/r_0.png")
         picture[0, 0] = 9, 9, 9, 0
@@ -309,7 +309,7 @@ class TestOut:
         (tmp_path / "out").mkdir()
         monkeypatch.chdir(tmp_path)
         offcenter(Path("scene"), Path("out/below/../"))
-        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list(TWINS)
+        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list(COPIES)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "scene"]
 
     @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
@@ -320,7 +320,7 @@ class TestOut:
         def fail(done: int, total: int) -> None:
             told.append((done, total))
             if done == 2:
-                assert list((tmp_path / "deep").glob(".making-*/out/shifted/train/*.png"))  # work was under way
+                assert list((tmp_path / "deep").glob(".partial-*/out/shifted/train/*.png"))  # work was under way
                 assert not (tmp_path / "deep/out").exists()
                 raise error
 
@@ -344,8 +344,8 @@ class TestCommand:
         out = tmp_path / "out"
         answer = edge_se("offcenter", "--data", scene, "--out", out, "--shift", -0.25, 0.125, "--pad", 0.3, 0.125)
         assert (answer.code, answer.err) == (0, "")
-        assert answer.out.split() == [str(out / twin) for twin in TWINS]
-        pictures = {twin: iio.imread(out / twin / "val/r_0.png") for twin in TWINS}
+        assert answer.out.split() == [str(out / copy) for copy in COPIES]
+        pictures = {copy: iio.imread(out / copy / "val/r_0.png") for copy in COPIES}
         source = iio.imread(scene / "val/r_0.png")
         np.testing.assert_array_equal(pictures["centered"], on_canvas(source, 38, 30, 7, 3), strict=True)
         np.testing.assert_array_equal(pictures["shifted"], on_canvas(source, 38, 30, 1, 6), strict=True)

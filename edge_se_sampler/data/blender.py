@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
-from edge_se_sampler.data import json_schema as field
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.data.image_file import ImageFile, read_image
-from edge_se_sampler.data.source_location import Where, shown
+from edge_se_sampler.data.image_file import read_image
+from edge_se_sampler.data.json_value import JsonValue, read_json
+from edge_se_sampler.data.source_location import SourceFile, SourceLocation, quote
 from edge_se_sampler.data.views import Views
 
 Split = Literal["train", "val", "test"]
@@ -24,49 +24,44 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _RIGID_TOLERANCE = 1e-3  # of the rotation's entries: real files are rounded
 _LAST_ROW_TOLERANCE = 1e-6  # 0 and 1 survive rounding, so this only forgives arithmetic
-_LEAST_ANGLE = 1e-6  # radians; below, focal lengths overflow before they mean anything
+_MIN_ANGLE = 1e-6  # radians; below, focal lengths overflow before they mean anything
 
-# What a frame, or the file for all frames, may say of its camera: sizes and lengths in pixels
-_SETTINGS: dict[str, field.Check[float]] = {
-    "w": field.count,
-    "h": field.count,
-    "cx": field.number,
-    "cy": field.number,
-    "fl_x": field.positive,
-    "fl_y": field.positive,
+# Of the image and its camera, all in pixels: for one frame, or at the top of the file for all frames
+_INTRINSICS = {
+    "w": JsonValue.count,
+    "h": JsonValue.count,
+    "cx": JsonValue.number,
+    "cy": JsonValue.number,
+    "fl_x": JsonValue.positive_number,
+    "fl_y": JsonValue.positive_number,
 }
-
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-
-@dataclass(frozen=True)
-class _Setting:
-    value: float
-    where: Where  # the frame's own field, or the file's
 
 
 @dataclass(frozen=True)
 class _Frame:
     """An entry of `frames`, checked as far as the json alone allows."""
 
-    where: Where
-    name: str  # file_path
-    mask_name: str | None  # mask_path
-    pose: np.ndarray  # (3, 4) float64, camera to world
-    settings: dict[str, _Setting]  # by their names in _SETTINGS; the frame's own win over the file's
+    location: SourceLocation
+    file_path: str
+    mask_path: str | None
+    pose: np.ndarray
+    """(3, 4) float64, camera to world."""
+    intrinsics: dict[str, JsonValue]
+    """By their names in _INTRINSICS; the frame's own replace the file's."""
 
     def get(self, key: str, default: float) -> float:
-        return self.settings[key].value if key in self.settings else default
+        return self.intrinsics[key].number() if key in self.intrinsics else default
 
 
 def transforms_path(folder: Path, split: str) -> Path:
-    """The json of a split."""
+    """The json file of a split."""
     return folder / f"transforms_{split}.json"
 
 
-def listed_file(name: str) -> str:
+def listed_file(path: str) -> str:
     """The file, relative to the folder, that a file_path or mask_path means: .png may be left out."""
-    return name if name.lower().endswith(_SUFFIXES) else f"{name}.png"
+    return path if path.lower().endswith(_SUFFIXES) else f"{path}.png"
 
 
 def has_split(folder: Path, split: str) -> bool:
@@ -75,101 +70,106 @@ def has_split(folder: Path, split: str) -> bool:
 
 
 def read_blender(folder: Path, split: Split) -> Views:
-    """Read one split of a scene; the files that no frame lists are not looked at.
+    """Read one split of a scene; files that no frame lists are ignored.
 
-    Poses are given as written (not moved, scaled or made orthonormal). Without masks every pixel counts; if some
-    frames have one, the others count whole. Raises InputError, in one line, for anything that cannot be used:
-    first for the folder, then for the json, then for paths, and only then for the images.
+    Poses are returned as written (not moved, scaled or orthonormalized). A frame without mask_path is trained on as a
+    whole.
+
+    Raises:
+        InputError: in one line, anything that cannot be used, first of the folder, then of the json, then of the
+            paths, and only then of the images.
     """
     folder = Path(folder)
     _check_folder(folder, split)
-    where = Where(transforms_path(folder, split))
-    top = field.load_object(where)
-    frames = _frames(top, where)
-    half_tan = _half_tan(top, where, frames)
-    files = [_locate(frame.name, frame.where.key("file_path"), folder) for frame in frames]
+    top = read_json(transforms_path(folder, split))
+    frames = _read_frames(top)
+    half_tan = _read_half_tan(top, frames)
+    files = [_locate(frame.file_path, frame.location.member("file_path"), folder) for frame in frames]
     _check_distinct(files)
     mask_files = [
-        _locate(frame.mask_name, frame.where.key("mask_path"), folder) if frame.mask_name is not None else None
+        None if frame.mask_path is None else _locate(frame.mask_path, frame.location.member("mask_path"), folder)
         for frame in frames
     ]
-    with ThreadPoolExecutor() as pool:  # decoding leaves Python's lock to others
+    with ThreadPoolExecutor() as pool:  # decoding releases Python's lock
         images = tuple(pool.map(read_image, files))
         _check_sizes(frames, files, images)
         masks = tuple(pool.map(_read_mask, mask_files, images)) if any(mask_files) else None
     if masks is not None and not any(mask.any() for mask in masks):
-        raise where.key("frames").error("all pixels of all views are masked", "masks are non-zero where to train")
-    return Views(tuple(frame.name for frame in frames), images, masks, _cameras(frames, images, half_tan))
+        hint = "masks are non-zero where to train"
+        raise top.location.member("frames").error("all pixels of all views are masked", hint)
+    return Views(tuple(frame.file_path for frame in frames), images, masks, _cameras(frames, images, half_tan))
 
 
 def _check_folder(folder: Path, split: str) -> None:
     """Raise InputError unless `folder` is a folder that has the split."""
-    where = Where(folder)
+    location = SourceLocation(folder)
+    hint = "give the folder that has the transforms_*.json files"
     if not os.path.lexists(folder):
-        raise where.error("no such folder", "give the folder that has the transforms_*.json files")
+        raise location.error("no such folder", hint)
     if not os.path.isdir(folder):
-        raise where.error("is not a folder", "give the folder that has the transforms_*.json files")
+        raise location.error("is not a folder", hint)
     if not os.access(folder, os.R_OK | os.X_OK):
-        raise where.error("may not be read (permission denied)", "change the folder's permissions")
+        raise location.error("may not be read (permission denied)", "change the folder's permissions")
     if has_split(folder, split):
         return
     found = ", ".join(transforms_path(folder, other).name for other in SPLITS if has_split(folder, other))
+    others = f"only {found}" if found else "nor that of any other split"
     hint = "a Blender scene has transforms_train.json and, for other splits, transforms_val.json, transforms_test.json"
-    has = f"only {found}" if found else "nor that of any other split"
-    raise where.error(f"has no {transforms_path(folder, split).name}, {has}", hint)
+    raise location.error(f"has no {transforms_path(folder, split).name}, {others}", hint)
 
 
-def _frames(top: field.Object, where: Where) -> list[_Frame]:
-    """All entries of `frames`, checked."""
+def _read_frames(top: JsonValue) -> list[_Frame]:
     hint = "list each view as {file_path, transform_matrix}"
-    entries = field.required(top, "frames", where, field.as_list, hint)
+    frames = top.required("frames", hint)
+    entries = frames.list()
     if not entries:
-        raise where.key("frames").error("is empty", hint)
-    shared = _settings(top, where)
-    return [_frame(entry, where.key("frames").item(i), shared) for i, entry in enumerate(entries)]
+        raise frames.location.error("is empty", hint)
+    shared = _read_intrinsics(top)
+    return [_read_frame(entry, shared) for entry in entries]
 
 
-def _frame(entry: Any, where: Where, shared: dict[str, _Setting]) -> _Frame:
-    frame = field.as_object(entry, where)
-    hint = "write the image's path, relative to the folder, without .png"
+def _read_frame(entry: JsonValue, shared: dict[str, JsonValue]) -> _Frame:
+    file_path = entry.required("file_path", "write the image's path, relative to the folder, without .png")
+    mask_path = entry.optional("mask_path")
     return _Frame(
-        where=where,
-        name=field.required(frame, "file_path", where, field.path_text, hint),
-        mask_name=field.optional(frame, "mask_path", where, field.path_text),
-        pose=field.required(frame, "transform_matrix", where, _pose, "write the 4x4 camera-to-world matrix"),
-        settings={**shared, **_settings(frame, where)},
+        location=entry.location,
+        file_path=file_path.file_path(),
+        mask_path=None if mask_path is None else mask_path.file_path(),
+        pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),
+        intrinsics=shared | _read_intrinsics(entry),
     )
 
 
-def _settings(parent: field.Object, where: Where) -> dict[str, _Setting]:
+def _read_intrinsics(parent: JsonValue) -> dict[str, JsonValue]:
+    """The checked intrinsics that the file or a frame states."""
     for key in _DISTORTION:
-        if key in parent and field.number(parent[key], where.key(key)) != 0:
-            problem = f"is {shown(parent[key])}, but rays here know no lens distortion"
-            raise where.key(key).error(problem, "undistort the images, and leave it out")
-    return {
-        key: _Setting(check(parent[key], where.key(key)), where.key(key))
-        for key, check in _SETTINGS.items()
-        if key in parent
-    }
+        coefficient = parent.optional(key)
+        if coefficient is not None and coefficient.number() != 0:
+            problem = f"is {quote(coefficient.value)}, but lens distortion is not supported"
+            raise coefficient.location.error(problem, "undistort the images, and leave it out")
+    stated = {}
+    for key, check in _INTRINSICS.items():
+        value = parent.optional(key)
+        if value is not None:
+            check(value)
+            stated[key] = value
+    return stated
 
 
-def _pose(value: Any, where: Where) -> np.ndarray:
+def _read_pose(matrix: JsonValue) -> np.ndarray:
     """The upper (3, 4) float64 of a rigid camera-to-world matrix; InputError for anything else."""
-    rows = field.as_list(value, where)
-    if len(rows) != 4 or any(not isinstance(row, list) or len(row) != 4 for row in rows):
-        raise where.error(f"must be 4 rows of 4 numbers, not {shown(value)}", "write the 4x4 camera-to-world matrix")
-    matrix = np.array(
-        [[field.number(x, where.item(i).item(j)) for j, x in enumerate(row)] for i, row in enumerate(rows)]
-    )
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > _LAST_ROW_TOLERANCE:
-        raise where.error(
-            f"its last row must be [0, 0, 0, 1], not {shown(rows[3])}",
-            "put the translation in the last column (transposed?)",
-        )
-    if not _is_rotation(matrix[:3, :3]):
+    rows = matrix.list()
+    if len(rows) != 4 or any(not isinstance(row.value, list) or len(row.value) != 4 for row in rows):
+        problem = f"must be 4 rows of 4 numbers, not {quote(matrix.value)}"
+        raise matrix.location.error(problem, "write the 4x4 camera-to-world matrix")
+    pose = np.array([[entry.number() for entry in row.list()] for row in rows])
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > _LAST_ROW_TOLERANCE:
+        problem = f"its last row must be [0, 0, 0, 1], not {quote(rows[3].value)}"
+        raise matrix.location.error(problem, "put the translation in the last column (transposed?)")
+    if not _is_rotation(pose[:3, :3]):
         hint = "its upper left 3x3 must be orthonormal with determinant +1: remove scale, shear and mirroring"
-        raise where.error("is not a rigid motion", hint)
-    return matrix[:3]
+        raise matrix.location.error("is not a rigid motion", hint)
+    return pose[:3]
 
 
 def _is_rotation(r: np.ndarray) -> bool:
@@ -180,68 +180,68 @@ def _is_rotation(r: np.ndarray) -> bool:
     return bool(off <= _RIGID_TOLERANCE and np.linalg.det(r) > 0)
 
 
-def _half_tan(top: field.Object, where: Where, frames: Sequence[_Frame]) -> float:
-    """tan(camera_angle_x / 2); NaN if there is no such angle, and every frame has the fl_x that makes up for it."""
-    angle = field.optional(top, "camera_angle_x", where, field.number)
+def _read_half_tan(top: JsonValue, frames: Sequence[_Frame]) -> float:
+    """tan(camera_angle_x / 2); NaN if there is no such angle and every frame has its fl_x instead."""
+    angle = top.optional("camera_angle_x")
     if angle is None:
         for frame in frames:
-            if "fl_x" not in frame.settings:
-                hint = f"add the horizontal field of view in radians, or give {frame.where.field} its fl_x in pixels"
-                raise where.key("camera_angle_x").error("is missing", hint)
+            if "fl_x" not in frame.intrinsics:
+                field = frame.location.field
+                hint = f"add the horizontal field of view in radians, or give {field} its fl_x in pixels"
+                raise top.location.member("camera_angle_x").error("is missing", hint)
         return math.nan
-    if not _LEAST_ANGLE <= angle < math.pi:
+    if not _MIN_ANGLE <= angle.number() < math.pi:
         hint = "write the horizontal field of view in radians (degrees times pi/180)"
-        raise where.key("camera_angle_x").error(f"must lie between 0 and pi, not {shown(angle)}", hint)
-    return math.tan(angle / 2)
+        raise angle.location.error(f"must lie between 0 and pi, not {quote(angle.value)}", hint)
+    return math.tan(angle.number() / 2)
 
 
-def _locate(name: str, where: Where, folder: Path) -> ImageFile:
+def _locate(name: str, location: SourceLocation, folder: Path) -> SourceFile:
     """The file that `name` means; InputError if that lies outside `folder`, be it through a link."""
     if os.path.isabs(name):
-        raise where.error(f"{shown(name)} is an absolute path", "write it relative to the folder")
+        raise location.error(f"{quote(name)} is an absolute path", "write it relative to the folder")
     listed = listed_file(name)
     path = Path(os.path.realpath(folder / listed))
     if not path.is_relative_to(os.path.realpath(folder)):
-        raise where.error(f"{shown(listed)} leads out of the folder", "put the file into the folder")
-    return ImageFile(where, listed, path)
+        raise location.error(f"{quote(listed)} leads out of the folder", "put the file into the folder")
+    return SourceFile(path, location, listed)
 
 
-def _check_distinct(files: Sequence[ImageFile]) -> None:
+def _check_distinct(files: Sequence[SourceFile]) -> None:
     """Raise InputError if two frames have one image."""
-    first: dict[Path, ImageFile] = {}
+    first: dict[Path, SourceFile] = {}
     for file in files:
         other = first.setdefault(file.path, file)
         if other is not file:
-            problem = f"{shown(file.name)} is already the image of {other.where.field}"
-            raise file.where.error(problem, "list every image once")
+            raise file.error(f"is already the image of {other.location.field}", "list every image once")
 
 
-def _check_sizes(frames: Sequence[_Frame], files: Sequence[ImageFile], images: Sequence[np.ndarray]) -> None:
+def _check_sizes(frames: Sequence[_Frame], files: Sequence[SourceFile], images: Sequence[np.ndarray]) -> None:
     """Raise InputError for an image whose size is neither the stated one nor, where none is stated, the first's."""
     for axis, key in enumerate(("h", "w")):
         for frame, file, image in zip(frames, files, images, strict=True):
             height, width = image.shape[:2]
-            found = f"{shown(file.name)} is {width} x {height} pixels"
-            stated = frame.settings.get(key)
-            if stated and stated.value != image.shape[axis]:
-                problem = f"is {stated.value}, but {found}"
-                raise stated.where.error(problem, f"correct {key} in the file or in the frame, or the image")
+            found = f"is {width} x {height} pixels"
+            stated = frame.intrinsics.get(key)
+            if stated and stated.count() != image.shape[axis]:
+                problem = f"is {stated.count()}, but {quote(file.name)} {found}"
+                raise stated.location.error(problem, f"correct {key} in the file or in the frame, or the image")
             if not stated and image.shape[axis] != images[0].shape[axis]:
                 first_height, first_width = images[0].shape[:2]
-                problem = f"{found}, the first image {first_width} x {first_height}"
-                raise file.where.error(problem, "give the frame its own w and h, or the image that size")
+                hint = "give the frame its own w and h, or the image that size"
+                raise file.error(f"{found}, the first image {first_width} x {first_height}", hint)
 
 
-def _read_mask(file: ImageFile | None, image: np.ndarray) -> np.ndarray:
-    """(H, W) bool: where a colour of the mask is not black; everywhere if there is no file."""
+def _read_mask(file: SourceFile | None, image: np.ndarray) -> np.ndarray:
+    """(H, W) bool: where a color of the mask is not black; everywhere if there is no file."""
     height, width = image.shape[:2]
     if file is None:
         return np.ones((height, width), dtype=bool)
-    colours = read_image(file)[..., :3]  # without alpha: an opaque black mask still masks
-    if colours.shape[:2] != (height, width):
-        found = f"{shown(file.name)} is {colours.shape[1]} x {colours.shape[0]} pixels"
-        raise file.where.error(f"{found}, its image {width} x {height}", "give the mask the size of its image")
-    return np.any(colours, axis=-1)
+    colors = read_image(file)[..., :3]  # without alpha: an opaque black mask still masks
+    if colors.shape[:2] != (height, width):
+        problem = f"is {colors.shape[1]} x {colors.shape[0]} pixels, its image {width} x {height}"
+        raise file.error(problem, "give the mask the size of its image")
+    return np.any(colors, axis=-1)
 
 
 def _cameras(frames: Sequence[_Frame], images: Sequence[np.ndarray], half_tan: float) -> Cameras:

@@ -4,7 +4,7 @@ W, H  size of a picture, pixels
 p     padding on either side, pixels: the canvas is W + 2 p_x by H + 2 p_y
 d     shift of the picture on its canvas, pixels, right and down positive
 
-The picture's upper left corner goes to p in the centred twin and to p + d in the shifted one.
+The picture's upper left corner goes to p in the centered copy and to p + d in the shifted one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-TWINS = ("centered", "shifted")
+COPIES = ("centered", "shifted")
 
 Pair = tuple[int, int]  # x, y
 
@@ -28,7 +28,7 @@ class Canvas:
 
     @classmethod
     def of(cls, image: np.ndarray, shift: tuple[float, float], pad: tuple[float, float] | None) -> Canvas:
-        """The canvas of an (H, W, ...) image; `shift` and `pad` are shares of W and H.
+        """The canvas of an (H, W, ...) image; `shift` and `pad` are fractions of W and H.
 
         Without `pad` the shifted picture just fits.
         """
@@ -44,9 +44,9 @@ class Canvas:
 
     @property
     def corners(self) -> dict[str, Pair]:
-        """The picture's upper left corner on the canvas, by twin."""
+        """The picture's upper left corner on the canvas, by copy."""
         x, y = self.pad
-        return dict(zip(TWINS, ((x, y), (x + self.shift[0], y + self.shift[1])), strict=True))
+        return dict(zip(COPIES, ((x, y), (x + self.shift[0], y + self.shift[1])), strict=True))
 
     def visible(self, corner: Pair) -> tuple[slice, slice]:
         """The rows and columns of the picture that land on the canvas."""
@@ -55,34 +55,34 @@ class Canvas:
         columns = slice(max(0, -x), min(self.picture[0], width - x))
         return rows, columns
 
-    def paste(self, image: np.ndarray, corner: Pair, colour: np.ndarray) -> np.ndarray:
-        """The (H', W', ...) canvas that shows an (H, W, ...) image at `corner`, and `colour` (...) around it."""
+    def paste(self, image: np.ndarray, corner: Pair, color: np.ndarray) -> np.ndarray:
+        """The (H', W', ...) canvas that shows an (H, W, ...) image at `corner`, and `color` (...) around it."""
         x, y = corner
         rows, columns = self.visible(corner)
-        canvas = np.full((self.size[1], self.size[0], *image.shape[2:]), colour, image.dtype)
+        canvas = np.full((self.size[1], self.size[0], *image.shape[2:]), color, image.dtype)
         canvas[rows.start + y : rows.stop + y, columns.start + x : columns.stop + x] = image[rows, columns]
         return canvas
 
-    def lost(self, foreground: np.ndarray) -> int:
-        """How many pixels of (H, W) bool `foreground` the shifted twin would cut off."""
+    def count_cut_off(self, foreground: np.ndarray) -> int:
+        """How many pixels of (H, W) bool `foreground` the shifted copy would cut off."""
         return int(np.count_nonzero(foreground) - np.count_nonzero(foreground[self.visible(self.corners["shifted"])]))
 
-    def least_pad(self, foreground: np.ndarray) -> tuple[float, float]:
-        """The smallest padding, as shares of W and H, with which the shifted twin keeps (H, W) bool `foreground`."""
+    def min_pad(self, foreground: np.ndarray) -> tuple[float, float]:
+        """The smallest padding, as fractions of W and H, with which the shifted copy keeps (H, W) bool `foreground`."""
         columns, rows = np.flatnonzero(foreground.any(axis=0)), np.flatnonzero(foreground.any(axis=1))
         (width, height), (right, down) = self.picture, self.shift
         return _overhang(columns + right, width) / width, _overhang(rows + down, height) / height
 
 
-def _overhang(places: np.ndarray, length: int) -> int:
+def _overhang(positions: np.ndarray, length: int) -> int:
     """How far the furthest of (n,) columns (or rows) lies outside 0 to length - 1."""
-    return max(0, -int(places.min()), int(places.max()) + 1 - length) if len(places) else 0
+    return max(0, -int(positions.min()), int(positions.max()) + 1 - length) if len(positions) else 0
 
 
-def background(image: np.ndarray) -> np.ndarray | None:
+def plain_background(image: np.ndarray) -> np.ndarray | None:
     """(C,) uint8, what lies around the object of an (H, W, C) image.
 
-    Transparent black for RGBA; for RGB the one colour of the image's border, None if that has several.
+    Transparent black for RGBA; for RGB the one color of the image's border, None if that has several.
     """
     if image.shape[2] == 4:
         return np.zeros(4, np.uint8)
@@ -90,6 +90,6 @@ def background(image: np.ndarray) -> np.ndarray | None:
     return border[0] if np.all(border == border[0]) else None
 
 
-def object_pixels(image: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """(H, W) bool: alpha above 0 for RGBA, other than the background's `colour` (3,) for RGB."""
-    return image[..., 3] > 0 if image.shape[2] == 4 else np.any(image != colour, axis=-1)
+def object_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """(H, W) bool: alpha above 0 for RGBA, other than the `background` color (3,) for RGB."""
+    return image[..., 3] > 0 if image.shape[2] == 4 else np.any(image != background, axis=-1)

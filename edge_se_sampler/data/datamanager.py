@@ -31,7 +31,7 @@ class VanillaDataManager:
         config: its settings, train_num_rays_per_batch resolved.
         views: the training views.
         device: of rays and batches; the images stay on the CPU as uint8.
-        background_color: RGB behind transparent pixels, for samplers that look at colours.
+        background_color: RGB behind transparent pixels, for samplers that look at colors.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class VanillaDataManager:
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
 
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
-        """(n,) squared errors of the model's fine colours, or of its coarse ones if so configured, in training mode."""
+        """(n,) squared errors of the model's fine colors, or of its coarse ones if so configured, in training mode."""
         image = unit_interval(batch["image"]).to(self.device)
         chunks = list(model.chunks(len(ray_bundle)))
         settings = self.train_pixel_sampler.config

@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all, and never in place of anything that is there."""
+"""New folders that appear whole or not at all, and never overwrite anything."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 from edge_se_sampler.errors import InputError
 
 
-def check_free(out: Path, targets: Sequence[Path]) -> None:
+def check_not_taken(out: Path, targets: Sequence[Path]) -> None:
     """Raises InputError unless every target, a path in `out`, can be written without touching anything there."""
     try:
-        there = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
-        if not there.is_dir():
-            raise InputError(f"out is {out}, but {there} is not a folder: give a folder, or a path that is free")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"out is {out}, but {there} is not writable: give a folder that is")
+        existing = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
+        if not existing.is_dir():
+            raise InputError(f"out is {out}, but {existing} is not a folder: give a folder, or a path that is free")
+        if not os.access(existing, os.W_OK | os.X_OK):
+            raise InputError(f"out is {out}, but {existing} is not writable: give a folder that is")
         for target in targets:
             empty_folder = target.is_dir() and not target.is_symlink() and not any(target.iterdir())
             if os.path.lexists(target) and not empty_folder:
@@ -29,17 +29,20 @@ def check_free(out: Path, targets: Sequence[Path]) -> None:
 
 
 @contextmanager
-def appearing(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
-    """A temporary folder inside `out` to write workspace/<name> of every target into; at the end they are moved.
+def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
+    """A temporary folder inside `out` in which to write workspace/<name> of every target; at the end they are moved.
 
-    On any exception it goes again, and so does what of `out` was not there. A target that was empty and no longer is
-    raises OSError: nothing is overwritten. A full disk is an InputError.
+    On any exception the temporary folder is removed, and with it the folders that were created for `out`.
+
+    Raises:
+        InputError: `out` cannot be written, or the disk is full.
+        OSError: a target was empty and no longer is; nothing is overwritten.
     """
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         try:
             out.mkdir(parents=True, exist_ok=True)
-            workspace = tempfile.TemporaryDirectory(prefix=".making-", dir=out)
+            workspace = tempfile.TemporaryDirectory(prefix=".partial-", dir=out)
         except OSError as error:
             raise InputError(f"out is {out}, which cannot be written ({error.strerror}): give another") from error
         with workspace:
@@ -49,7 +52,7 @@ def appearing(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
                     target.rmdir()  # empty, or this raises
                 (Path(workspace.name) / target.name).rename(target)
     except BaseException as error:
-        with suppress(OSError):  # someone else's files have come in between: they stay
+        with suppress(OSError):  # other programs' files have come in between: they stay
             for folder in missing:
                 folder.rmdir()
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -1,10 +1,10 @@
-"""Cameras: where they stand, and where in the image they show the object.
+"""Cameras of the synthetic scenes: where they stand, and where in the image they show the object.
 
 S  side of the square image (the canvas), pixels
 d  offset of the object from the image's middle, whole pixels, right and down positive
-s  = S - 2 max|d|: side of the frame the object would fill, were it centred; what it loses to make room for d
+s  = S - 2 max|d|: side of the frame the object would fill, were it centered; what it loses to make room for d
 f  focal length, pixels: s / (2 tan(FIELD_OF_VIEW / 2))
-(cx, cy)  principal point, pixels; pixel (i, j) has its centre at (i + 1/2, j + 1/2)
+(cx, cy)  principal point, pixels; pixel (i, j) has its center at (i + 1/2, j + 1/2)
 
 A pose is a 4x4 camera-to-world matrix in NeRF's convention: x right, y up, the camera looks along -z.
 """
@@ -22,7 +22,7 @@ from edge_se_sampler.errors import InputError
 
 FIELD_OF_VIEW = 0.6911112070083618  # radians, as in NeRF's Blender scenes
 DISTANCE = 4.031128874149275  # of the cameras from the origin, world units; likewise
-SMALLEST_FRAME = 8  # pixels; in less an object is a blot
+MIN_FRAME = 8  # pixels; in less an object is a blot
 
 Placement = Literal["centered", "padded", "shifted", "rotated"]
 Split = Literal["train", "val", "test"]
@@ -79,35 +79,35 @@ class Framing:
         return intrinsics
 
     def camera(self, pose: Array) -> Camera:
-        """The view from `pose` (4, 4), which looks at the origin; "rotated" turns it in place."""
+        """The view from `pose` (4, 4), which looks at the origin; "rotated" rotates it in place."""
         if self.placement == "rotated":
-            pose = _turned(pose, vector([self.shift[0] / self.focal, -self.shift[1] / self.focal, -1]))
+            pose = _rotated_toward(pose, vector([self.shift[0] / self.focal, -self.shift[1] / self.focal, -1]))
         return Camera(pose, self.focal, self.principal, self.size, self.size)
 
 
 def framing(size: int, placement: Placement = "centered", offset: tuple[float, float] = (0.0, 0.0)) -> Framing:
-    """Places the object `offset` (right, down; shares of the image's side) from the middle of size x size pixels.
+    """Places the object `offset` (right, down; fractions of the image's side) from the middle of size x size pixels.
 
     "centered" ignores the offset; "padded" only makes room for it; "shifted" moves the principal point, "rotated"
-    turns the cameras.
+    rotates the cameras.
 
     Raises InputError if `size` is below 8, the placement is unknown, or the offset leaves the object a frame of
     fewer than 8 pixels.
     """
-    if size < SMALLEST_FRAME:
-        raise InputError(f"size is {size} pixels: give at least {SMALLEST_FRAME}")
+    if size < MIN_FRAME:
+        raise InputError(f"size is {size} pixels: give at least {MIN_FRAME}")
     if placement not in get_args(Placement):
         raise InputError(f"placement is {placement!r}: give one of {', '.join(get_args(Placement))}")
     shift = (0, 0)
     if placement != "centered":
-        if not all(math.isfinite(share) for share in offset):
-            raise InputError(f"offset is {tuple(offset)}: give two finite numbers, shares of the image's side")
+        if not all(math.isfinite(fraction) for fraction in offset):
+            raise InputError(f"offset is {tuple(offset)}: give two finite numbers, fractions of the image's side")
         shift = (round(offset[0] * size), round(offset[1] * size))
     frame = size - 2 * max(abs(shift[0]), abs(shift[1]))
-    if frame < SMALLEST_FRAME:
+    if frame < MIN_FRAME:
         raise InputError(
             f"offset {tuple(offset)} at size {size} leaves the object {max(frame, 0)} pixels: it needs"
-            f" {SMALLEST_FRAME}, so give an offset nearer to zero or a larger size"
+            f" {MIN_FRAME}, so give an offset nearer to zero or a larger size"
         )
     return Framing(size, placement, shift, 0.5 * frame / math.tan(FIELD_OF_VIEW / 2))
 
@@ -119,17 +119,18 @@ def poses(split: Split, count: int, seed: int = 0) -> list[Array]:
     wavy ring at 15 to 45 degrees of elevation, walked in steps of the golden ratio so that any number is spread.
     """
     if split == "test":
-        turns = [index / _GOLDEN_RATIO % 1 for index in range(count)]
-        elevations = [math.radians(30 + 15 * math.sin(4 * math.pi * turn)) for turn in turns]
+        revolutions = [index / _GOLDEN_RATIO % 1 for index in range(count)]
+        elevations = [math.radians(30 + 15 * math.sin(4 * math.pi * revolution)) for revolution in revolutions]
     else:
         drawn = np.random.RandomState(seed + _SEED_OFFSET[split]).rand(count, 2).tolist()
-        turns = [first for first, _ in drawn]
+        revolutions = [first for first, _ in drawn]
         # Short of the horizon, and of the pole, where "up" has no direction in the image.
         elevations = [math.asin(0.02 + 0.96 * second) for _, second in drawn]
-    return [_looking_at_origin(2 * math.pi * turn, up) for turn, up in zip(turns, elevations, strict=True)]
+    pairs = zip(revolutions, elevations, strict=True)
+    return [_look_at_origin(2 * math.pi * revolution, elevation) for revolution, elevation in pairs]
 
 
-def _looking_at_origin(azimuth: float, elevation: float) -> Array:
+def _look_at_origin(azimuth: float, elevation: float) -> Array:
     back = vector(
         [
             math.cos(elevation) * math.cos(azimuth),
@@ -141,22 +142,22 @@ def _looking_at_origin(azimuth: float, elevation: float) -> Array:
     return _pose(np.stack([right, cross(back, right), back], axis=1), DISTANCE * back)
 
 
-def _turned(pose: Array, toward: Array) -> Array:
-    """`pose` turned in place, by the smallest angle, until it sees along `toward` what it saw along -z."""
+def _rotated_toward(pose: Array, toward: Array) -> Array:
+    """`pose` rotated in place, by the smallest angle, until it sees along `toward` what it saw along -z."""
     x, y, z = unit(toward)
-    share = 1 / (1 - z)
-    to_axis = vector(  # the smallest turn that takes `toward` to -z
+    k = 1 / (1 - z)
+    to_axis = vector(  # the smallest rotation that takes `toward` to -z
         [
-            [1 - share * x * x, -share * x * y, x],
-            [-share * x * y, 1 - share * y * y, y],
+            [1 - k * x * x, -k * x * y, x],
+            [-k * x * y, 1 - k * y * y, y],
             [-x, -y, -z],
         ]
     )
     return _pose(compose(pose[:3, :3], to_axis), pose[:3, 3])
 
 
-def _pose(turn: Array, eye: Array) -> Array:
+def _pose(rotation: Array, eye: Array) -> Array:
     pose = np.eye(4)
-    pose[:3, :3] = turn
+    pose[:3, :3] = rotation
     pose[:3, 3] = eye
     return np.round(pose, 12)  # the same number on every platform, and in the json

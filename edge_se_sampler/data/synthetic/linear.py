@@ -3,7 +3,7 @@
 A vector is an array (3, ...) and a linear map an array (3 rows, 3 columns, ...); trailing axes broadcast. BLAS
 kernels, `np.linalg`, `np.einsum` and numpy's own sin, cos and power choose instructions by the CPU and differ in
 their last bits. Sums, products, quotients and square roots of float64 do not: IEEE 754 rounds each of them
-correctly. So nothing else touches a made pixel.
+correctly. So nothing else touches a pixel.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def inverse_affine(m: Array) -> Array:
 
 
 def rotation(axis: ArrayLike, degrees: float) -> Array:
-    """Right-handed turn (3, 3) about an axis of any length (Rodrigues)."""
+    """Right-handed rotation (3, 3) about an axis of any length (Rodrigues)."""
     x, y, z = unit(axis)
     angle = math.radians(degrees)
     k = vector([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,4 +1,4 @@
-"""Surface patterns: how much of a material's second colour shows at a point, 0 to 1.
+"""Surface patterns: how much of a material's second color shows at a point, 0 to 1.
 
 q  point times the pattern's frequency, so that a period is 1; in the world for most patterns, in the solid's own
    frame for rings
@@ -14,8 +14,8 @@ from edge_se_sampler.data.synthetic.scene import Pattern
 _LATTICE_PRIMES = (374761393, 668265263, 2147483647)
 
 
-def second_share(pattern: int, world: Array, local: Array, frequency: Array) -> Array:
-    """Share (n,) of the second colour at points (3, n), given in the world and in their solids' frames."""
+def second_color_weight(pattern: int, world: Array, local: Array, frequency: Array) -> Array:
+    """Weight (n,), 0 to 1, of the second color at points (3, n), given in the world and in their solids' frames."""
     q = world * frequency
     if pattern == Pattern.CHECKER:
         i, j, k = np.floor(q + 1e-4)  # 1e-4: a face that lies in a lattice plane does not flicker

@@ -1,6 +1,6 @@
 """From a scene and a camera to a picture: sampling, averaging, tone.
 
-A pixel averages SAMPLES_PER_AXIS^2 rays on a regular grid. Alpha is the share of them that meets the scene; colour
+A pixel averages SAMPLES_PER_AXIS^2 rays on a regular grid. Alpha is the fraction of them that hits the scene; color
 is the mean radiance of those alone (straight alpha), clipped, sRGB-encoded. Float64 throughout, then 8 bits.
 """
 
@@ -37,7 +37,7 @@ def render_view(
     """One view of a synthetic scene.
 
     `camera_to_world` is (4, 4) or (3, 4) in NeRF's convention (x right, y up, looking along -z; a rotation and an eye
-    in world units), `focal` and `principal` (x, y) are in pixels, pixel (0, 0) having its centre at (0.5, 0.5).
+    in world units), `focal` and `principal` (x, y) are in pixels, pixel (0, 0) having its center at (0.5, 0.5).
     Returns (height, width, 4) RGBA, 8 bits, straight alpha, sRGB-encoded; the same bytes on every machine.
 
     Raises InputError for a name that is not in SCENE_NAMES.

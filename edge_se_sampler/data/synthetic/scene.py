@@ -7,7 +7,7 @@ within BALL_RADIUS of it, so that no view clips one. P is the number of solids, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from itertools import pairwise, product
 
@@ -27,8 +27,8 @@ from edge_se_sampler.data.synthetic.linear import (
 )
 from edge_se_sampler.data.synthetic.solids import Kind
 
-# World units. Small enough that the default offset keeps the ball's image whole when the cameras are turned instead of
-# shifted, which stretches what is off the axis; the centred frame would hold a ball of 1.36.
+# World units. Small enough that the default offset keeps the ball's image whole when the cameras are rotated instead
+# of shifted, which stretches what is off the axis; the centered frame would hold a ball of 1.36.
 BALL_RADIUS = 1.15
 _DECIMALS = 12  # of every matrix: swallows the last bits in which one platform's sin differs from another's
 
@@ -39,7 +39,7 @@ Color = tuple[float, float, float]  # linear RGB, 0 to 1
 
 
 class Pattern(IntEnum):
-    """How a material mixes its two colours over a surface."""
+    """How a material mixes its two colors over a surface."""
 
     PLAIN = 0
     CHECKER = 1
@@ -51,13 +51,13 @@ class Pattern(IntEnum):
 
 @dataclass(frozen=True)
 class Material:
-    """What a solid looks like: two linear RGB colours, a pattern of them, and how it reflects."""
+    """What a solid looks like: two linear RGB colors, a pattern of them, and how it reflects."""
 
     color: Color
     second_color: Color | None = None  # None: the same as `color`
     pattern: Pattern = Pattern.PLAIN
     frequency: float = 1.0  # periods of the pattern per world unit
-    reflectance: float = 0.04  # share of light mirrored at normal incidence by a non-metal
+    reflectance: float = 0.04  # fraction of light mirrored at normal incidence by a non-metal
     roughness: float = 0.5  # 0 mirror to 1 matt
     metalness: float = 0.0  # 0 or 1
 
@@ -84,7 +84,7 @@ class Scene:
     to_world: Array  # (3, 4, P) the solid's frame -> world
     to_local: Array  # (3, 4, P) its inverse
     corners: Array  # (3, 8, P) of each solid's box, world
-    radius: Array  # (P,) of a ball around the solid's centre that holds it
+    radius: Array  # (P,) of a ball around the solid's center that holds it
     material: Index  # (P,) index into `materials`
     materials: Materials
 
@@ -118,17 +118,17 @@ class _Solid:
 
 @dataclass
 class SceneBuilder:
-    """Collects solids in any unit and place; `build` fits them into the ball."""
+    """Collects solids in any unit and position; `build` fits them into the ball."""
 
     _solids: list[_Solid] = field(default_factory=list)
 
-    def sphere(self, center: ArrayLike, radii: ArrayLike, material: Material, turn: Array = _UPRIGHT) -> None:
-        """An ellipsoid with half axes `radii` (one number or three) along the columns of `turn`."""
-        self._add(Kind.SPHERE, turn * np.broadcast_to(vector(radii), 3), center, material)
+    def sphere(self, center: ArrayLike, radii: ArrayLike, material: Material, rotation: Array = _UPRIGHT) -> None:
+        """An ellipsoid with half axes `radii` (one number or three) along the columns of `rotation`."""
+        self._add(Kind.SPHERE, rotation * np.broadcast_to(vector(radii), 3), center, material)
 
-    def box(self, center: ArrayLike, half_sizes: ArrayLike, material: Material, turn: Array = _UPRIGHT) -> None:
-        """A box with half sizes (3) along the columns of `turn`."""
-        self._add(Kind.BOX, turn * vector(half_sizes), center, material)
+    def box(self, center: ArrayLike, half_sizes: ArrayLike, material: Material, rotation: Array = _UPRIGHT) -> None:
+        """A box with half sizes (3) along the columns of `rotation`."""
+        self._add(Kind.BOX, rotation * vector(half_sizes), center, material)
 
     def tube(
         self, start: ArrayLike, end: ArrayLike, radius: float, material: Material, end_radius: float | None = None
@@ -167,6 +167,7 @@ class SceneBuilder:
         half_diagonals = apply(to_world[:, :3, None], _CUBE[..., None])  # (3, 8, P)
         half_axes = length(to_world[:, :3])
         materials = list(dict.fromkeys(solid.material for solid in solids))
+        plain = [replace(m, second_color=m.second_color or m.color) for m in materials]
         return Scene(
             kind=kind,
             taper=np.array([solid.taper for solid in solids]).T,
@@ -175,7 +176,7 @@ class SceneBuilder:
             corners=half_diagonals + to_world[:, 3][:, None],
             radius=np.where(kind == Kind.SPHERE, half_axes.max(axis=0), length(half_diagonals).max(axis=0)),
             material=np.array([materials.index(solid.material) for solid in solids]),
-            materials=_tabulate(materials),
+            materials=Materials(**{f.name: np.array([getattr(m, f.name) for m in plain]).T for f in fields(Materials)}),
         )
 
     def _add(
@@ -187,15 +188,3 @@ class SceneBuilder:
         taper: tuple[float, float] = (1.0, 0.0),
     ) -> None:
         self._solids.append(_Solid(kind, linear, vector(center), taper, material))
-
-
-def _tabulate(materials: Sequence[Material]) -> Materials:
-    return Materials(
-        color=np.array([m.color for m in materials]).T,
-        second_color=np.array([m.second_color or m.color for m in materials]).T,
-        pattern=np.array([m.pattern for m in materials]),
-        frequency=np.array([m.frequency for m in materials]),
-        reflectance=np.array([m.reflectance for m in materials]),
-        roughness=np.array([m.roughness for m in materials]),
-        metalness=np.array([m.metalness for m in materials]),
-    )

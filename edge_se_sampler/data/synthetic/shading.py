@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from edge_se_sampler.data.synthetic.linear import Array, Index, apply, dot, unit, vector
-from edge_se_sampler.data.synthetic.patterns import second_share, smooth_step
+from edge_se_sampler.data.synthetic.patterns import second_color_weight, smooth_step
 from edge_se_sampler.data.synthetic.scene import Pattern, Scene
 from edge_se_sampler.data.synthetic.solids import outward_normals
 from edge_se_sampler.data.synthetic.visibility import KEY_DIRECTION, NOTHING, in_shadow, nearest_hits
@@ -23,7 +23,7 @@ _AMBIENT_BELOW = vector([0.20, 0.18, 0.17])[:, None]
 _GROUND = vector([0.24, 0.21, 0.19])[:, None]
 _HORIZON = vector([0.62, 0.68, 0.76])[:, None]
 _TOWARD_ZENITH = vector([0.03, 0.12, 0.30])[:, None]
-_SOFT_BOXES = (  # direction, colour, cosine of the angle at which it ends
+_SOFT_BOXES = (  # direction, color, cosine of the angle at which it ends
     (unit([-0.6, -0.5, 0.62]), vector([2.6, 2.5, 2.4])[:, None], 0.90),
     (unit([0.1, 0.85, 0.5]), vector([1.5, 1.6, 1.9])[:, None], 0.95),
 )
@@ -92,7 +92,7 @@ def _mirror(scene: Scene, surroundings: Array, which: Index, origins: Array, dir
 
 
 def _albedo(scene: Scene, material: Index, local: Array, world: Array) -> Array:
-    """Base colour (3, n) with its pattern."""
+    """Base color (3, n) with its pattern."""
     table = scene.materials
     albedo = table.color[:, material]
     patterns = table.pattern[material]
@@ -101,8 +101,8 @@ def _albedo(scene: Scene, material: Index, local: Array, world: Array) -> Array:
             continue
         which = np.nonzero(patterns == pattern)[0]
         kind = material[which]
-        share = second_share(pattern, world[:, which], local[:, which], table.frequency[kind])
-        albedo[:, which] = (1 - share) * table.color[:, kind] + share * table.second_color[:, kind]
+        weight = second_color_weight(pattern, world[:, which], local[:, which], table.frequency[kind])
+        albedo[:, which] = (1 - weight) * table.color[:, kind] + weight * table.second_color[:, kind]
     return albedo
 
 

@@ -31,9 +31,9 @@ def first_hits(scene: Scene, camera: Camera, per_axis: int) -> tuple[Array, Inde
     Returns t (rows, columns) along rays of unit depth and the solid's index, NOTHING where there is none.
     """
     x_slopes, y_slopes = camera.sample_slopes(per_axis)
-    turn, eye = camera.to_world[:3, :3], camera.to_world[:3, 3]
+    rotation, eye = camera.to_world[:3, :3], camera.to_world[:3, 3]
     local_eye = apply(scene.to_local[:, :3], eye) + scene.to_local[:, 3]
-    local_turn = compose(scene.to_local[:, :3], turn)
+    local_rotation = compose(scene.to_local[:, :3], rotation)
     depth = np.full((len(y_slopes), len(x_slopes)), np.inf)
     seen = np.full(depth.shape, NOTHING)
     for solid, (left, right, top, bottom) in enumerate(_windows(scene, camera, per_axis)):
@@ -41,7 +41,7 @@ def first_hits(scene: Scene, camera: Camera, per_axis: int) -> tuple[Array, Inde
             continue
         x = x_slopes[None, left:right]
         y = y_slopes[top:bottom, None]
-        along_x, along_y, back = local_turn[..., solid].T
+        along_x, along_y, back = local_rotation[..., solid].T
         direction = [along_x[k] * x + (along_y[k] * y - back[k]) for k in range(3)]
         t = hit_distance(scene.kind[solid], scene.taper[:, solid], local_eye[:, solid], direction, 1e-6)
         window = np.s_[top:bottom, left:right]

@@ -42,7 +42,7 @@ def check_name(name: str) -> None:
     """Raises InputError if no synthetic scene is called `name`."""
     if name in _BUILDERS:
         return
-    known = {ANALOG_OF[made]: made for made in SCENE_NAMES} | {made: made for made in SCENE_NAMES}
+    known = {ANALOG_OF[scene]: scene for scene in SCENE_NAMES} | {scene: scene for scene in SCENE_NAMES}
     nearest = known[get_close_matches(name, known, n=1, cutoff=0)[0]]
     raise InputError(
         f"no synthetic scene is called {name!r}: did you mean {nearest!r}? There are {', '.join(SCENE_NAMES)}"

@@ -60,8 +60,8 @@ def _track(scene: SceneBuilder, y: float) -> None:
     for degrees in spaced(-75, 75, 5):
         out, up = 0.12 * math.cos(math.radians(degrees)), 0.12 * math.sin(math.radians(degrees))
         for side, x in ((1, 0.28), (-1, -0.53)):
-            plate_turn = rotation((0, 1, 0), -side * degrees)
-            scene.box((x + side * out, y, -0.45 + up), (0.018, 0.13, 0.035), DARK, plate_turn)
+            tilt = rotation((0, 1, 0), -side * degrees)
+            scene.box((x + side * out, y, -0.45 + up), (0.018, 0.13, 0.035), DARK, tilt)
 
 
 def _body(scene: SceneBuilder) -> None:

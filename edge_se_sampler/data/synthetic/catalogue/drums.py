@@ -43,17 +43,17 @@ def drums(scene: SceneBuilder) -> None:
 
 
 def _drum(
-    scene: SceneBuilder, center: ArrayLike, radius: float, half_height: float, turn: Array, lugs: int = 8
+    scene: SceneBuilder, center: ArrayLike, radius: float, half_height: float, axes: Array, lugs: int = 8
 ) -> None:
     center = vector(center)
-    up = half_height * turn[:, 2]
+    up = half_height * axes[:, 2]
     scene.tube(center - up, center + up, radius, SHELL)
-    scene.tube(center + up, center + up + 0.012 * turn[:, 2], 0.97 * radius, HEAD)
+    scene.tube(center + up, center + up + 0.012 * axes[:, 2], 0.97 * radius, HEAD)
     for end in (-1, 1):
-        hoop = [center + end * up + apply(turn, point) for point in ring(1.02 * radius, 20)]
+        hoop = [center + end * up + apply(axes, point) for point in ring(1.02 * radius, 20)]
         scene.polyline(hoop, 0.014, CHROME, joints=False)
     for k in range(lugs):
-        lug = center + apply(turn, around(1.05 * radius, 2 * math.pi * k / lugs))
+        lug = center + apply(axes, around(1.05 * radius, 2 * math.pi * k / lugs))
         scene.tube(lug - up, lug + up, 0.009, CHROME)
         scene.sphere(lug, 0.025, CHROME)
 
@@ -62,10 +62,10 @@ def _cymbal(
     scene: SceneBuilder, center: ArrayLike, radius: float, tilt: float, foot: tuple[float, float, float]
 ) -> None:
     center = vector(center)
-    turn = rotation((1, 0.4, 0), tilt)
-    up = turn[:, 2]
+    axes = rotation((1, 0.4, 0), tilt)
+    up = axes[:, 2]
     scene.tube(center - 0.025 * up, center + 0.015 * up, radius, BRASS, end_radius=0.25 * radius)
-    scene.sphere(center + 0.01 * up, (0.08, 0.08, 0.045), BRASS, turn)
+    scene.sphere(center + 0.01 * up, (0.08, 0.08, 0.045), BRASS, axes)
     scene.tube(foot, center + 0.07 * up, 0.012, CHROME)
     for k in range(3):
         leg = vector(foot) + around(0.2, 2.1 * k + 0.3)

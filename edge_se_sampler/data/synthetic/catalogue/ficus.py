@@ -48,8 +48,8 @@ class _Tree:
         for k in range(3 if generations > 1 else 2 + self.random.randint(2)):
             aside = self._normal()
             aside = unit(aside - dot(aside, direction) * direction)
-            turned = 0.75 * direction + 0.8 * aside
-            self.grow(points[-1 - k % 2], turned, 0.62 * size, 0.6 * radius, generations - 1)
+            outward = 0.75 * direction + 0.8 * aside
+            self.grow(points[-1 - k % 2], outward, 0.62 * size, 0.6 * radius, generations - 1)
 
     def _leaf_out(self, points: list[Array], direction: Array) -> None:
         for point in points:
@@ -61,9 +61,9 @@ class _Tree:
         face = vector([0, 0, 1]) + 0.7 * self._normal()
         face = unit(face - dot(face, along) * along)
         half = 0.075 + 0.05 * self.random.rand()
-        turn = np.stack([along, cross(face, along), face], axis=1)
+        rotation = np.stack([along, cross(face, along), face], axis=1)
         material = LEAVES[self.random.randint(3)]
-        self.scene.sphere(stem + (half + 0.03) * along, (half, 0.42 * half, 0.006), material, turn)
+        self.scene.sphere(stem + (half + 0.03) * along, (half, 0.42 * half, 0.006), material, rotation)
         self.scene.tube(stem, stem + 0.05 * along, 0.004, BARK)
 
     def _normal(self) -> Array:

@@ -25,17 +25,17 @@ def hotdog(scene: SceneBuilder) -> None:
     _hotdog(scene, 0.36, rotation((0, 0, 1), 6), KETCHUP, waves=14.4)
 
 
-def _hotdog(scene: SceneBuilder, y: float, turn: Array, sauce: Material, waves: float) -> None:
-    def place(*point: float) -> Array:
-        return apply(turn, vector(point)) + vector([0, y, 0])
+def _hotdog(scene: SceneBuilder, y: float, axes: Array, sauce: Material, waves: float) -> None:
+    def to_world(*point: float) -> Array:
+        return apply(axes, vector(point)) + vector([0, y, 0])
 
     for side in (-1, 1):
-        leaning = compose(turn, rotation((1, 0, 0), 12 * side))
-        scene.sphere(place(0, 0.17 * side, -0.08), (0.80, 0.17, 0.17), BUN, leaning)
-    scene.sphere(place(0, 0, -0.12), (0.76, 0.2, 0.12), CRUMB, turn)
-    sausage = [place(x, 0.02 * math.sin(3 * x), 0.045 + 0.03 * x * x) for x in spaced(-0.88, 0.88, 9)]
+        leaning = compose(axes, rotation((1, 0, 0), 12 * side))
+        scene.sphere(to_world(0, 0.17 * side, -0.08), (0.80, 0.17, 0.17), BUN, leaning)
+    scene.sphere(to_world(0, 0, -0.12), (0.76, 0.2, 0.12), CRUMB, axes)
+    sausage = [to_world(x, 0.02 * math.sin(3 * x), 0.045 + 0.03 * x * x) for x in spaced(-0.88, 0.88, 9)]
     scene.polyline(sausage, 0.105, SAUSAGE)
     for end in (sausage[0], sausage[-1]):
         scene.sphere(end, 0.105, SAUSAGE)
-    line = [place(x, 0.075 * math.sin(waves * x), 0.16 + 0.03 * x * x) for x in spaced(-0.78, 0.78, 36)]
+    line = [to_world(x, 0.075 * math.sin(waves * x), 0.16 + 0.03 * x * x) for x in spaced(-0.78, 0.78, 36)]
     scene.polyline(line, 0.024, sauce)

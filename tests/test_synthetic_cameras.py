@@ -67,7 +67,7 @@ def test_test_cameras_are_spread() -> None:
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_shifted_and_padded_are_the_centred_picture_pasted(name: str) -> None:
+def test_shifted_and_padded_are_the_centered_picture_pasted(name: str) -> None:
     scene = synthetic_scene(name)
     pose = poses("train", 2)[1]
     size, frame = 40, 24

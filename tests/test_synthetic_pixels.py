@@ -67,7 +67,7 @@ def test_pixels_do_not_depend_on_the_cpu() -> None:
     if not extras:
         pytest.skip("this CPU has nothing to switch off")
     report = (
-        "import sys, json, tests.test_made_pixels as t\n"
+        "import sys, json, tests.test_synthetic_pixels as t\n"
         "umath = t.importlib.import_module(sys.argv[1])._multiarray_umath\n"
         "on = [f for f in umath.__cpu_dispatch__ if umath.__cpu_features__[f]]\n"
         "print(json.dumps([on, {n: [t.digest(t.small_picture(n)), t.float_digest(n)] for n in t.SCENE_NAMES}]))\n"

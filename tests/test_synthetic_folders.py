@@ -57,7 +57,7 @@ def test_folder_tells_the_truth(placement: Placement, tmp_path: Path) -> None:
     for split, count in (("train", 2), ("test", 1)):
         document = json.loads((tmp_path / "bricks" / f"transforms_{split}.json").read_text())
         assert document["analog_of"] == "lego"
-        assert document["made_by"] == "edge_se_sampler"
+        assert document["generated_by"] == "edge_se_sampler"
         assert ("cx" in document, "cy" in document) == (placement == "shifted",) * 2
         assert (document["camera_angle_x"] == FIELD_OF_VIEW) == (placement == "centered")
         assert [frame["file_path"] for frame in document["frames"]] == [f"./{split}/r_{i}" for i in range(count)]
@@ -87,9 +87,7 @@ def test_processes_make_the_same_pictures(tmp_path: Path) -> None:
         progress=lambda done, total: heard.append((done, total)),
     )
     assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == ["chair", "mic"]
-    assert heard[-1] == (12, 12)
-    assert [done for done, _ in heard] == sorted({done for done, _ in heard})
-    assert len(heard) < 12
+    assert heard == [(done, 12) for done in range(1, 13)]
     for name in ("mic", "chair"):
         assert (
             json.loads((tmp_path / f"new/out/{name}/transforms_val.json").read_text())["analog_of"] == ANALOG_OF[name]
@@ -117,7 +115,7 @@ BAD_ARGUMENTS = [
     pytest.param({"placement": "shifted", "offset": (math.nan, 0)}, "offset.*finite", id="offset nan"),
     pytest.param(
         {"names": ["hotdog"], "placement": "rotated", "offset": (0.3, 0.3)},
-        "offset turns hotdog out.*train/r_0",
+        "offset rotates hotdog out.*train/r_0",
         id="clipped",
     ),
 ]
@@ -181,7 +179,7 @@ def test_out_that_is_not_writable(tmp_path: Path) -> None:
 )
 def test_a_failure_leaves_nothing_behind(num_train: int, error: type[BaseException], tmp_path: Path) -> None:
     def fail(done: int, total: int) -> None:
-        assert list((tmp_path / "deep" / "out").glob(".making-*/mic/train/*.png"))  # work was under way
+        assert list((tmp_path / "deep" / "out").glob(".partial-*/mic/train/*.png"))  # work was under way
         raise error
 
     with pytest.raises(error):
@@ -228,9 +226,9 @@ def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
     ) as process:
         assert process.stdout is not None
         if moment == "workers at work":
-            assert process.stdout.readline() == "5\n"
+            assert process.stdout.readline() == "1\n"
         else:
-            while not list(tmp_path.glob("out/.making-*/ficus/*test.json")):  # the last thing before they are started
+            while not list(tmp_path.glob("out/.partial-*/ficus/*test.json")):  # the last thing before they are started
                 assert process.poll() is None
                 time.sleep(0.01)
             time.sleep(0.15)

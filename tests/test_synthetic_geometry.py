@@ -182,7 +182,7 @@ def test_alpha_of_a_ball_is_its_silhouette() -> None:
     spread = (np.arange(SAMPLES_PER_AXIS) + 0.5) / SAMPLES_PER_AXIS
     samples = (np.arange(64)[:, None] + spread).ravel()
     from_center = np.hypot(*np.meshgrid(samples - camera.principal[0], samples - camera.principal[1]))
-    cone = math.tan(math.asin(BALL_RADIUS / DISTANCE))  # the camera looks at the ball's centre: a circle
+    cone = math.tan(math.asin(BALL_RADIUS / DISTANCE))  # the camera looks at the ball's center: a circle
     seen = from_center / camera.focal < cone
     share = seen.reshape(64, SAMPLES_PER_AXIS, 64, SAMPLES_PER_AXIS).mean(axis=(1, 3))
     np.testing.assert_array_equal(alpha, np.rint(255 * share))
