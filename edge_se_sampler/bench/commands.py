@@ -10,6 +10,7 @@ import tyro
 
 from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart
 from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring, BenchStep
+from edge_se_sampler.bench.stability.command import BenchStability
 from edge_se_sampler.errors import InputError, check_known
 
 
@@ -135,55 +136,6 @@ class BenchPaper(_Parallel):
         for error in result["errors"]:
             print(f"table {error['table']}, {error['scene']}, {error['strategy']}, {error['seed']}: {error['error']}")
         print(f"{len(result['runs'])} cells; see {self.output_dir / 'report.html'}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchStability(_Parallel):
-    """Map where training dies, by strategy and setting; leave result.json, table.md and pictures. Goes on where it
-    was ended."""
-
-    output_dir: Path
-    """Where the result goes; trainings that it already has are kept."""
-    workplace: Path = Path("bench")
-    """Where views of failed trainings are kept, for the sheet."""
-    points: tuple[int, ...] = ()
-    """Numbers of points on the map; none: all. --dry-run tells what they are."""
-    strategies: tuple[str, ...] = ()
-    """Of the paper's six, revived and auto; none: all."""
-    seeds: tuple[int, ...] = tuple(range(10))
-    """Of weights, pixels and jitter."""
-    dry_run: tyro.conf.UseCounterAction[int] = 0
-    """Only tell which points there are, and how much is done; trains nothing, writes nothing."""
-
-    def run(self) -> None:
-        from edge_se_sampler.bench.experiment import begun, executor_of, missing, run_cells
-        from edge_se_sampler.bench.stability.settings import STRATEGIES, cells, points
-        from edge_se_sampler.bench.stability.summary import write_outputs
-        from edge_se_sampler.bench.stability.train import Scale, run_cell
-        from edge_se_sampler.engine.figures import require_pyplot
-        from edge_se_sampler.engine.files import make_folder
-
-        check_known("points", self.points, range(len(points())))
-        check_known("strategies", self.strategies, STRATEGIES)
-        if not self.seeds:
-            raise InputError("--seeds: give at least one")
-        workers = self.processes()
-        scale, path = Scale(), self.output_dir / "result.json"
-        todo, result = cells(self.points, self.strategies, self.seeds), begun(path, scale)
-        if self.dry_run:
-            for number in sorted({cell.point for cell in todo}):
-                print(f"point {number:2}: {points()[number].label}")
-            print(f"{len(todo)} trainings of {scale.iterations} steps, {len(missing(todo, result))} still to do")
-            return
-        require_pyplot()
-        new_executor = executor_of(workers, self.scheduler)
-        make_folder(self.output_dir, "--output-dir")
-        views = (self.workplace / "stability").resolve()
-        run_cells(todo, result, path, new_executor, run_cell, lambda _: (scale, views))
-        write_outputs(result, views, self.output_dir)
-        for error in result["errors"]:
-            print(f"point {error['point']}, {error['strategy']}, {error['seed']}: {error['error']}")
-        print(f"{len(result['runs'])} trainings; see {self.output_dir / 'table.md'}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,4 @@
-"""The map's object, as large in the image and where a point wants it, in front of its background.
-
-f   share of the pixels with any alpha, a mean over the training views; it grows with the square of the focal length
-"""
+"""The sweep's images: one object, as large and where a setting wants it, in front of the setting's background."""
 
 from __future__ import annotations
 
@@ -20,11 +17,11 @@ from edge_se_sampler.data.synthetic.render import render_view
 from edge_se_sampler.data.views import Views
 
 SCENE = "materials"
-"""Compact: it fits into the image at f = 30 %, and at 10 % off centre."""
+"""Compact: it fits into the image when it covers 30 % of it, and off centre when it covers 10 %."""
 SIZE = 48
+NUM_TRAIN, NUM_TEST = 40, 4
 SHIFT = (10, 7)
-"""Pixels, right and down: as far from the middle as the demo's."""
-TEST_VIEWS = 4
+"""Pixels, right and down, off centre: about as far from the middle, as a share of the image, as in the demo."""
 COLORS: dict[str, tuple[float, float, float]] = {
     "white": (1.0, 1.0, 1.0),
     "black": (0.0, 0.0, 0.0),
@@ -34,48 +31,48 @@ COLORS: dict[str, tuple[float, float, float]] = {
 
 
 @lru_cache(maxsize=4)
-def views(foreground: float, shifted: bool, count: int) -> tuple[Views, Views]:
-    """Training views and held-out ones of the object covering that share of an image."""
-    first = _focal(foreground, SIZE, count)
-    return _rendered("train", first, shifted, count), _rendered("test", first, shifted, TEST_VIEWS)
+def render_splits(foreground: float, shifted: bool, num_train: int) -> tuple[Views, Views]:
+    """Training and held-out views.
+
+    Args:
+        foreground: share of the pixels that show the object (any alpha), a mean over the training views.
+        shifted: whether the object is off centre.
+    """
+    focal = _find_focal(foreground, SIZE, num_train)
+    return _render("train", focal, shifted, num_train), _render("test", focal, shifted, NUM_TEST)
 
 
 @lru_cache(maxsize=16)
-def _focal(foreground: float, start: float, count: int, steps: int = 3) -> float:
-    """The focal length, pixels, at which f is what is asked for: the square root's rule, applied until it is true."""
+def _find_focal(foreground: float, start: float, num_train: int, steps: int = 3) -> float:
+    """Focal length in pixels at which the object covers that share; the share grows with its square, nearly."""
     focal = start
     for _ in range(steps):
-        found = np.mean(
-            [(image[..., 3] > 0).mean() for image in _rendered("train", focal, False, min(count, 8)).images]
-        )
-        focal *= math.sqrt(foreground / float(found))
+        images = _render("train", focal, False, min(num_train, 8)).images
+        covered = np.mean([(image[..., 3] > 0).mean() for image in images])
+        focal *= math.sqrt(foreground / float(covered))
     return focal
 
 
-def _rendered(split: str, focal: float, shifted: bool, count: int) -> Views:
+def _render(split: str, focal: float, shifted: bool, count: int) -> Views:
     dx, dy = SHIFT if shifted else (0, 0)
-    principal = (SIZE / 2 + dx, SIZE / 2 + dy)
+    cx, cy = SIZE / 2 + dx, SIZE / 2 + dy
     matrices = poses("test" if split == "test" else "train", count)
-    images = tuple(render_view(SCENE, pose, focal, principal, SIZE, SIZE) for pose in matrices)
-    return Views(
-        tuple(f"{split}/r_{i}" for i in range(count)),
-        images,
-        None,
-        Cameras.of(matrices, fx=focal, fy=focal, cx=principal[0], cy=principal[1], width=SIZE, height=SIZE),
-    )
+    images = tuple(render_view(SCENE, pose, focal, (cx, cy), SIZE, SIZE) for pose in matrices)
+    cameras = Cameras.of(matrices, fx=focal, fy=focal, cx=cx, cy=cy, width=SIZE, height=SIZE)
+    return Views(tuple(f"{split}/r_{i}" for i in range(count)), images, None, cameras)
 
 
 def background_of(background: Background) -> Callable[[RayBundle], Tensor] | None:
-    """What a model sees behind a ray, (n, 3); None: a random colour for each, which its config has."""
+    """Rays -> (n, 3) colors behind them; None: random ones, which the model's config has."""
     if background == "random":
         return None
     if background == "textured":
-        return _texture
+        return _stripes
     color = torch.tensor(COLORS[background])
     return lambda rays: color.to(rays.origins).expand(len(rays), 3)
 
 
-def _texture(rays: RayBundle) -> Tensor:
-    """Coloured stripes at infinity, each some four pixels wide: no plain colour to fall back on."""
-    tilt = rays.directions.new_tensor([[31.0, 17.0, 9.0], [-13.0, 29.0, 21.0], [19.0, -11.0, 33.0]])
-    return 0.5 + 0.4 * torch.sin(rays.directions @ tilt.T)
+def _stripes(rays: RayBundle) -> Tensor:
+    """Colored stripes at infinity, each some four pixels wide: no plain color explains them."""
+    wave_vectors = rays.directions.new_tensor([[31.0, 17.0, 9.0], [-13.0, 29.0, 21.0], [19.0, -11.0, 33.0]])
+    return 0.5 + 0.4 * torch.sin(rays.directions @ wave_vectors.T)

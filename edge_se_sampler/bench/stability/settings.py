@@ -1,126 +1,120 @@
-"""Where on the map of stability a training stands: a base point, each axis varied alone, and the pairs that matter.
-
-f   share of an image that shows the object, a mean over the views
+"""The robustness sweep: a base setting, every axis varied alone, and the pairs that matter; and the strategies that are
+trained in each setting.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
+
+from edge_se_sampler.bench.overrides import SAMPLER
+from edge_se_sampler.bench.strategies import LABELS
 
 Background = Literal["white", "black", "grey", "green", "random", "textured"]
 
 
 @dataclass(frozen=True)
 class Strategy:
-    """How pixels are chosen, and whether dead networks begin anew."""
+    """How pixels are sampled, and whether dead networks are reinitialised."""
 
     label: str
-    early: str
-    late: str
-    schedule: str = "fraction"
-    reinit_dead: bool = False
+    method: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    """Dotted path -> value, of the method's config (`override`)."""
 
 
+REINIT = {"reinit_dead": True}
 STRATEGIES = {
-    "vanilla-nerf": Strategy("Random", "uniform", "uniform"),
-    "revived": Strategy("Random, dead networks anew", "uniform", "uniform", reinit_dead=True),
-    "precrop-nerf": Strategy("Precrop + Random", "precrop", "uniform"),
-    "se-nerf": Strategy("SE", "uniform", "se"),
-    "precrop-se-nerf": Strategy("Precrop + SE", "precrop", "se"),
-    "edge-nerf": Strategy("Edge", "edge", "uniform"),
-    "edge-se-nerf": Strategy("Edge + SE", "edge", "se"),
-    "auto": Strategy("Edge + SE, auto, dead anew", "edge", "se", schedule="adaptive", reinit_dead=True),
+    **{method: Strategy(label, method) for method, label in LABELS.items()},
+    "reinit": Strategy("Random, reinitialised", "vanilla-nerf", REINIT),
+    "adaptive": Strategy(
+        "Edge + SE, adaptive, reinitialised", "edge-se-nerf", REINIT | {f"{SAMPLER}.schedule": "adaptive"}
+    ),
 }
-"""The paper's six, and those that repair."""
+"""The paper's six; and two that give new weights to networks that have died."""
 
 
 @dataclass(frozen=True)
-class Point:
-    """A configuration; the defaults are the base point."""
+class Setting:
+    """What is trained on what; the defaults are the base setting."""
 
     foreground: float = 0.05
-    """f."""
+    """Share of an image's pixels that show the object, a mean over the views."""
     placement: Literal["centered", "shifted"] = "centered"
-    views: int = 40
+    num_views: int = 40
     background: Background = "white"
-    activation: Literal["relu", "softplus"] = "relu"
+    density_activation: Literal["relu", "softplus"] = "relu"
     initialization: Literal["xavier", "torch"] = "xavier"
-    noise: float = 0.0
+    density_noise: float = 0.0
     """Standard deviation, on the raw density."""
     depth: int = 4
-    rate: float = 1.0
-    """Of the learning rate."""
-
-    @property
-    def changes(self) -> dict[str, Any]:
-        """What differs from the base point."""
-        return {key: value for key, value in asdict(self).items() if value != getattr(BASE, key)}
-
-    @property
-    def label(self) -> str:
-        """The changes in words."""
-        return ", ".join(WORDS[key].format(value) for key, value in self.changes.items()) or "base"
+    lr_scale: float = 1.0
+    """Factor of the learning rate."""
 
 
-BASE = Point()
 WORDS = {
-    "foreground": "f {:.0%}",
+    "foreground": "object {:.0%}",
     "placement": "off centre",
-    "views": "{} views",
-    "background": "{}",
-    "activation": "{}",
-    "initialization": "{} weights",
-    "noise": "noise {:g}",
-    "depth": "depth {}",
-    "rate": "rate x{:g}",
+    "num_views": "{} views",
+    "background": "{} background",
+    "density_activation": "{} density",
+    "initialization": "{} initialisation",
+    "density_noise": "density noise {:g}",
+    "depth": "{} layers",
+    "lr_scale": "learning rate x{:g}",
 }
 AXES: dict[str, tuple[Any, ...]] = {
     "foreground": (0.01, 0.02, 0.10, 0.30),
     "placement": ("shifted",),
-    "views": (10,),
+    "num_views": (10,),
     "background": ("black", "grey", "green", "random", "textured"),
-    "activation": ("softplus",),
+    "density_activation": ("softplus",),
     "initialization": ("torch",),
-    "noise": (1.0,),
+    "density_noise": (1.0,),
     "depth": (8,),
-    "rate": (3.0,),
+    "lr_scale": (3.0,),
 }
-"""What each axis takes besides the base point's value."""
+"""The values of each axis besides the base setting's."""
 PAIRS: tuple[dict[str, Any], ...] = (
     {"foreground": 0.01, "placement": "shifted"},
     {"foreground": 0.02, "placement": "shifted"},
     {"foreground": 0.10, "placement": "shifted"},
-    {"placement": "shifted", "views": 10},
+    {"placement": "shifted", "num_views": 10},
     {"initialization": "torch", "depth": 8},
-    {"initialization": "torch", "activation": "softplus"},
-    {"placement": "shifted", "activation": "softplus"},
+    {"density_activation": "softplus", "initialization": "torch"},
+    {"placement": "shifted", "density_activation": "softplus"},
 )
-"""Smaller and elsewhere; elsewhere and fewer; what a port begins with, and the cure it may have."""
+"""Small and off centre; off centre and few views; what PyTorch ports start with, and softplus, which may help them."""
 
 
-def points() -> list[Point]:
-    """The map: base, axes, pairs."""
-    alone = [replace(BASE, **{axis: value}) for axis, values in AXES.items() for value in values]
-    return [BASE, *alone, *(replace(BASE, **pair) for pair in PAIRS)]
+def _label(changes: dict[str, Any]) -> str:
+    return ", ".join(WORDS[axis].format(value) for axis, value in changes.items()) or "base"
+
+
+_CHANGES = [{}, *({axis: value} for axis, values in AXES.items() for value in values), *PAIRS]
+SETTINGS = {_label(changes): replace(Setting(), **changes) for changes in _CHANGES}
+"""Label, which says what differs from the base setting -> setting."""
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One training of the map."""
+class Trial:
+    """One training of the sweep."""
 
-    point: int
-    """Number in `points()`."""
+    setting: str
+    """Label in `SETTINGS`."""
     strategy: str
+    """Name in `STRATEGIES`."""
     seed: int
 
     @property
     def name(self) -> str:
-        """A name for its files."""
-        return f"point-{self.point}-{self.strategy}-{self.seed}"
+        """For the terminal and for files."""
+        return re.sub(r"\W+", "-", f"{self.setting} {self.strategy} {self.seed}")
 
 
-def cells(chosen: tuple[int, ...], strategies: tuple[str, ...], seeds: tuple[int, ...]) -> list[Cell]:
-    """All trainings asked for, seed by seed, so that an unfinished map is a coarser one."""
-    numbers = chosen or tuple(range(len(points())))
-    return [Cell(n, name, seed) for seed in seeds for n in numbers for name in strategies or tuple(STRATEGIES)]
+def list_all_trials(settings: Iterable[str], strategies: Iterable[str], seeds: Iterable[int]) -> list[Trial]:
+    """Every setting with every strategy, seed by seed, so that an unfinished sweep covers all of them."""
+    settings, strategies = tuple(settings), tuple(strategies)
+    return [Trial(setting, strategy, seed) for seed in seeds for setting in settings for strategy in strategies]

@@ -1,7 +1,4 @@
-"""One training of the map, and how it ended, of the coarse and of the fine network.
-
-share   error on the object as a share of an empty scene's
-"""
+"""One training of the sweep: how its coarse and its fine network end."""
 
 from __future__ import annotations
 
@@ -9,7 +6,8 @@ import contextlib
 import io
 import tempfile
 import time
-from dataclasses import asdict, dataclass, replace
+from collections import defaultdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.bench.outcome import outcome
-from edge_se_sampler.bench.stability.scenes import COLORS, background_of, views
-from edge_se_sampler.bench.stability.settings import STRATEGIES, Cell, Point, points
-from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
+from edge_se_sampler.bench.outcomes import Outcome, classify
+from edge_se_sampler.bench.overrides import MANAGER, MODEL, override
+from edge_se_sampler.bench.stability.scenes import COLORS, NUM_TRAIN, background_of, render_splits
+from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Setting, Trial
 from edge_se_sampler.engine.evaluation import Picture, pictures_of, render_rays
 from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.metrics import psnr
@@ -31,18 +29,17 @@ from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import keep_freed_memory
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
 
-Ending = Literal["learnt", "slow", "dead at the start", "killed by the data", "opaque background"]
+FailureMode = Literal["underfit", "dead at the start", "emptied", "opaque background"]
 LEARNING_RATE = 3e-3
-LOOKS = 10
-"""So often a training is looked at."""
+NUM_EVALUATIONS = 10
+"""Of a training, on its way."""
 
 
 @dataclass(frozen=True)
-class Scale:
+class TrainingSize:
     """How large the trainings are."""
 
     iterations: int = 300
@@ -53,105 +50,113 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Measured:
+class Rendered:
     """What a network shows of held-out views."""
 
     share: float
+    """Squared error on the object as a share of the background's alone."""
     psnr: float
     background_psnr: float
-    """Of the empty scene."""
+    """Of the background alone."""
     accumulation: float
-    """Mean opacity of the rays that meet nothing."""
+    """Mean opacity, in [0, 1], of the rays that miss the object."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """By the rule of all experiments."""
+        return classify(self.psnr, self.background_psnr, self.share)
+
+    def failure_mode(self, dead_at_start: bool) -> FailureMode | None:
+        """How the network failed, if it did.
+
+        Args:
+            dead_at_start: whether it had no density anywhere before the first step.
+        """
+        if self.outcome == "converged":
+            return None
+        if self.outcome == "underfit":
+            return "underfit"
+        if dead_at_start:
+            return "dead at the start"
+        return "opaque background" if self.accumulation > 0.5 else "emptied"
 
 
-def ending(measured: Measured, dead_at_start: bool) -> Ending:
-    """How a training ended.
-
-    As `outcome` has it; where nothing was learnt, it began without a gradient, or is empty, or hides everything
-    behind an opaque background.
-    """
-    rough = outcome(measured.psnr, measured.background_psnr, measured.share)
-    if rough != "background":
-        return rough
-    if dead_at_start:
-        return "dead at the start"
-    return "opaque background" if measured.accumulation > 0.5 else "killed by the data"
-
-
-def trainer_of(point: Point, strategy: str, seed: int, scale: Scale, folder: Path) -> tuple[Trainer, list[Picture]]:
-    """A point's training, about to begin, and its held-out views."""
-    chosen = STRATEGIES[strategy]
-    train, test = views(point.foreground, point.placement == "shifted", 40)
-    model = NeRFModelConfig(
-        "tiny", width=scale.width, depth=point.depth, num_coarse_samples=scale.samples,
-        num_importance_samples=scale.samples, density_activation=point.activation,
-        initialization=point.initialization, density_noise=point.noise,
-        background_color="random" if point.background == "random" else "white",
-    )  # fmt: skip
-    config: TrainerConfig = method_configs()["edge-se-nerf"]
-    settings: dict[str, Any] = {"early": chosen.early, "late": chosen.late, "schedule": chosen.schedule}
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
-    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=scale.rays, pixel_sampler=sampler)
-    config = replace(
-        config,
-        output_dir=folder,
-        experiment_name="stability",
-        max_num_iterations=scale.iterations,
-        machine=MachineConfig(seed=seed, device_type="cpu"),
-        optimizer=replace(config.optimizer, lr=LEARNING_RATE * point.rate),
-        pipeline=replace(config.pipeline, datamanager=manager, model=model),
-        reinit_dead=chosen.reinit_dead,
-    )
-    train = train.subset(range(point.views))
-    config = resolve_config(config, train)
-    in_front_of = COLORS.get(point.background, COLORS["white"])
-    datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=in_front_of)
-    pipeline = Pipeline(datamanager, build_model(config, "cpu"))
-    pipeline.model.background_fn = background_of(point.background)
-    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), pictures_of(test)
-
-
-def run_cell(cell: Cell, scale: Scale, views_folder: Path) -> dict[str, Any]:
-    """Train a cell and judge it; runs in a process of its own.
+def run_trial(trial: Trial, size: TrainingSize, views_folder: Path) -> dict[str, Any]:
+    """Train once; called in a process of its own. If the training fails, its `panel` goes to views_folder.
 
     Returns:
-        its place, of each network how it ended and what it shows, the fine one's share at LOOKS times, how many
-        networks began anew, CPU seconds. A failed one's portrait goes to views_folder.
+        outcome and failure_mode of the fine network and coarse_failure_mode; what both networks render
+        (`Rendered`); which were dead_at_start; how many were reinitialized; the fine one's `share` at each of
+        NUM_EVALUATIONS evaluations; cpu_seconds.
     """
     torch.set_num_threads(1)
     keep_freed_memory()
-    point = points()[cell.point]
-    began = time.process_time()
+    start = time.process_time()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
-        trainer, pictures = trainer_of(point, cell.strategy, cell.seed, scale, Path(folder))
+        trainer, pictures = build_trainer(SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder))
         model = trainer.pipeline.model
-        probe = [picture.rays(model.device)[::2] for picture in pictures]
-        dead, shares = dead_networks(model, probe), []
-        for step in range(scale.iterations):
+        dead, shares = dead_networks(model, [picture.rays(model.device)[::2] for picture in pictures]), []
+        for step in range(size.iterations):
             trainer.train_iteration(step)
-            if (step + 1) % max(1, scale.iterations // LOOKS) == 0:
-                shares.append(round(measured(model, pictures, stride=5)["fine"].share, 4))
-        revived = 0 if trainer.dead_network_reset is None else trainer.dead_network_reset.used_sub_seeds
-    told: dict[str, Any] = {}
-    for level, shown in measured(model, pictures).items():
-        told |= {f"{level}_ending": ending(shown, level in dead)}
-        told |= {f"{level}_{key}": round(value, 4) for key, value in asdict(shown).items()}
-    if told["fine_ending"] != "learnt":
+            if (step + 1) % max(1, size.iterations // NUM_EVALUATIONS) == 0:
+                shares.append(round(render_networks(model, pictures, stride=5)["fine"].share, 4))
+        resets = trainer.dead_network_reset
+    rendered = render_networks(model, pictures)
+    modes = {network: result.failure_mode(network in dead) for network, result in rendered.items()}
+    if modes["fine"] is not None:
         views_folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(views_folder / f"{cell.name}.png", png_bytes(portrait(model, pictures[0])))
+        write_atomically(views_folder / f"{trial.name}.png", png_bytes(panel(model, pictures[0])))
+    measures = {
+        f"{network}_{key}": round(value, 4)
+        for network, result in rendered.items()
+        for key, value in asdict(result).items()
+    }
     return {
-        **asdict(cell),
-        **point.changes,
-        "outcome": told["fine_ending"],
-        **told,
+        "outcome": rendered["fine"].outcome,
+        "failure_mode": modes["fine"],
+        "coarse_failure_mode": modes["coarse"],
+        **measures,
         "dead_at_start": dead,
-        "revived": revived,
+        "reinitialized": 0 if resets is None else resets.used_sub_seeds,
         "shares": shares,
-        "cpu_seconds": round(time.process_time() - began, 2),
+        "cpu_seconds": round(time.process_time() - start, 2),
     }
 
 
-def portrait(model: NeRFModel, picture: Picture) -> np.ndarray:
+def build_trainer(
+    setting: Setting, strategy: str, seed: int, size: TrainingSize, folder: Path
+) -> tuple[Trainer, list[Picture]]:
+    """A training that is ready to begin, its run in a folder, and its held-out views."""
+    train, test = render_splits(setting.foreground, setting.placement == "shifted", NUM_TRAIN)
+    train = train.subset(range(setting.num_views))
+    changes = {
+        "output_dir": folder,
+        "experiment_name": "stability",
+        "max_num_iterations": size.iterations,
+        "machine.seed": seed,
+        "machine.device_type": "cpu",
+        "optimizer.lr": LEARNING_RATE * setting.lr_scale,
+        f"{MANAGER}.train_num_rays_per_batch": size.rays,
+        f"{MODEL}.size": "tiny",
+        f"{MODEL}.width": size.width,
+        f"{MODEL}.depth": setting.depth,
+        f"{MODEL}.num_coarse_samples": size.samples,
+        f"{MODEL}.num_importance_samples": size.samples,
+        f"{MODEL}.density_activation": setting.density_activation,
+        f"{MODEL}.initialization": setting.initialization,
+        f"{MODEL}.density_noise": setting.density_noise,
+        f"{MODEL}.background_color": "random" if setting.background == "random" else "white",
+    }
+    method = STRATEGIES[strategy]
+    config = resolve_config(override(method_configs()[method.method], changes | method.changes), train)
+    color = COLORS.get(setting.background, COLORS["white"])
+    datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=color)
+    pipeline = Pipeline(datamanager, build_model(config, "cpu"))
+    pipeline.model.background_fn = background_of(setting.background)
+    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), pictures_of(test)
+
+
+def panel(model: NeRFModel, picture: Picture) -> np.ndarray:
     """A held-out view, what the fine network renders of it, and its opacity, side by side: (H, 3 W, 3) in [0, 1]."""
     height, width, channels = picture.image.shape
     rays = picture.rays(model.device)
@@ -159,39 +164,36 @@ def portrait(model: NeRFModel, picture: Picture) -> np.ndarray:
         render_rays(model, rays, key) for key in ("rgb_fine", "accumulation_fine", "background")
     )
     truth = target_colors(torch.from_numpy(picture.image).reshape(-1, channels), background)
-    panels = [panel.expand(-1, 3).reshape(height, width, 3) for panel in (truth, rendered, opacity)]
-    return torch.cat(panels, dim=1).clamp(0, 1).numpy()
+    images = [image.expand(-1, 3).reshape(height, width, 3) for image in (truth, rendered, opacity)]
+    return torch.cat(images, dim=1).clamp(0, 1).numpy()
 
 
 @torch.no_grad()
-def measured(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict[str, Measured]:
-    """The coarse and the fine network against the held-out views, every stride-th pixel."""
+def render_networks(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict[str, Rendered]:
+    """What the coarse and the fine network show of held-out views, measured on every stride-th pixel."""
     was_training = model.training
     model.eval()
-    images = [torch.from_numpy(picture.image).reshape(-1, 4)[::stride] for picture in pictures]
-    errors, accumulations = ({level: [] for level in model.networks} for _ in range(2))
-    distances = []
-    for picture, image in zip(pictures, images, strict=True):
+    columns: dict[str, list[Tensor]] = defaultdict(list)
+    for picture in pictures:
         rays = picture.rays(model.device)[::stride]
+        pixels = torch.from_numpy(picture.image).reshape(-1, 4)[::stride]
         for rows in model.chunks(len(rays)):
-            outputs = model(rays[rows])
-            away = target_colors(image[rows], outputs["background"]) - outputs["background"]
-            distances.append(away.square().sum(dim=1))
-            for level in model.networks:
-                errors[level].append(model.squared_error(outputs, image[rows], level))
-                accumulations[level].append(outputs[f"accumulation_{level}"][:, 0])
+            outputs, image = model(rays[rows]), pixels[rows]
+            contrast = target_colors(image, outputs["background"]) - outputs["background"]
+            columns["background_error"].append(contrast.square().sum(dim=1))
+            columns["hits"].append(image[:, 3] > 0)
+            for network in model.networks:
+                columns[f"{network}_error"].append(model.squared_error(outputs, image, network))
+                columns[f"{network}_accumulation"].append(outputs[f"accumulation_{network}"][:, 0])
     model.train(was_training)
-    distance, inside = torch.cat(distances), torch.cat(images)[:, 3] > 0
+    values = {name: torch.cat(parts) for name, parts in columns.items()}
+    hits, background_error = values["hits"], values["background_error"]
     return {
-        level: _measured(torch.cat(errors[level]), torch.cat(accumulations[level]), distance, inside)
-        for level in model.networks
+        network: Rendered(
+            share=float(values[f"{network}_error"][hits].sum() / background_error[hits].sum()),
+            psnr=psnr(float(values[f"{network}_error"].mean() / 3)),
+            background_psnr=psnr(float(background_error.mean() / 3)),
+            accumulation=float(values[f"{network}_accumulation"][~hits].mean()),
+        )
+        for network in model.networks
     }
-
-
-def _measured(error: Tensor, accumulation: Tensor, distance: Tensor, inside: Tensor) -> Measured:
-    return Measured(
-        share=float(error[inside].sum() / distance[inside].sum()),
-        psnr=psnr(float(error.mean() / 3)),
-        background_psnr=psnr(float(distance.mean() / 3)),
-        accumulation=float(accumulation[~inside].mean()),
-    )
