@@ -20,7 +20,7 @@ from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
 from edge_se_sampler.engine.inspection import inspect
-from edge_se_sampler.engine.session import load_model, prepare, summary
+from edge_se_sampler.engine.session import describe_run, load_model, prepare
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import lean
@@ -277,7 +277,7 @@ def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: P
     loss = [trainer.train_iteration(step) for step in range(3)]
     assert all(np.isfinite(loss))
     assert (views.train_pixel_sampler.strategy, views.train_pixel_sampler.watch.observations) == ("edge", 3)
-    assert "pixels   edge until the object is learnt, then uniform" in summary(trainer)
+    assert "pixels   edge until the object is learned, then uniform" in describe_run(trainer)
 
 
 @pytest.mark.parametrize("by_alpha", [True, False])

@@ -34,7 +34,7 @@ def prepare(config: TrainerConfig) -> Trainer:
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     plan = resolve_config(config, views)
-    keep_freed_memory()
+    disable_malloc_trimming()
     pipeline = Pipeline.build(plan, views, device)
     return plan.setup(run=RunFolder.create(plan), pipeline=pipeline, preview=preview)
 
@@ -50,7 +50,7 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))  # before anything is built on it
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
-    keep_freed_memory()
+    disable_malloc_trimming()
     trainer = config.setup(run=run, pipeline=Pipeline.build(config, views, device), preview=preview)
     trainer.resume(state)
     return trainer
@@ -124,8 +124,8 @@ def chosen_views(config: TrainerConfig, count: int) -> list[int] | None:
     return list(config.views)
 
 
-def summary(trainer: Trainer) -> str:
-    """A planned run in a few lines."""
+def describe_run(trainer: Trainer) -> str:
+    """Where a run is written, its model, its length and its sampling, in four lines at most."""
     config, manager = trainer.config, trainer.pipeline.datamanager.config
     model, sampler = config.pipeline.model, manager.pixel_sampler
     lines = [
@@ -134,7 +134,7 @@ def summary(trainer: Trainer) -> str:
         f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
     ]
     if isinstance(sampler, SamplingSettings):
-        until = "until the object is learnt"
+        until = "until the object is learned"
         if sampler.schedule != "adaptive":
             until = f"for {math.ceil(sampler.early_length(config.max_num_iterations or 0))} iterations"
         early = "" if sampler.early == sampler.late else f"{sampler.early} {until}, then "
@@ -160,11 +160,11 @@ def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
     return views, None
 
 
-def keep_freed_memory() -> None:
-    """Let glibc keep large freed blocks instead of returning them to the kernel after every operation.
+def disable_malloc_trimming() -> None:
+    """Make glibc's malloc keep large freed blocks instead of returning them to the kernel. Without glibc, do nothing.
 
-    A CPU training step allocates the same megabytes again and again; faulting their pages in anew costs a third
-    of it. Elsewhere than glibc this does nothing.
+    A training step on a CPU allocates the same megabytes again and again: the page faults of fresh ones take a third
+    of its time.
     """
     m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
     with contextlib.suppress(OSError, AttributeError):

@@ -26,7 +26,7 @@ from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import keep_freed_memory
+from edge_se_sampler.engine.session import disable_malloc_trimming
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.nerf import NeRFModel
@@ -90,7 +90,7 @@ def run_trial(trial: Trial, size: TrainingSize, views_folder: Path) -> dict[str,
         NUM_EVALUATIONS evaluations; cpu_seconds.
     """
     torch.set_num_threads(1)
-    keep_freed_memory()
+    disable_malloc_trimming()
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         trainer, pictures = build_trainer(SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder))

@@ -1,0 +1,279 @@
+"""What every command of `edge-se` takes, and what it calls. Torch is imported only when a command runs."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.methods import method_configs, registered_methods
+from edge_se_sampler.models.config import LeanModelConfig, check_fineness
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Train Random and Edge + SE on an off-center, mostly white scene, and compare them: a few minutes."""
+
+    output_dir: Path = Path()
+    """Folder for demo.png, demo.json and demo/ (the scene and the runs)."""
+    seed: int = 0
+    """Seed of weights, pixels and jitter; both methods start from the same weights."""
+
+    def run(self) -> None:
+        from edge_se_sampler.bench.demo import METHODS, demo
+
+        for outcome in demo(self.output_dir, self.seed):
+            print(
+                f"{METHODS[outcome.method]:>9}: {outcome.results['psnr']:.2f} dB in {outcome.seconds:.0f} s of training"
+            )
+        print(f"see {self.output_dir / 'demo.png'} and {self.output_dir / 'demo.json'}")
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Render the seven synthetic scenes (stand-ins for NeRF's) as Blender folders."""
+
+    out: Path
+    """Folder for one folder per scene; nothing existing is overwritten."""
+    names: tuple[str, ...] = ("chair", "drums", "ficus", "hotdog", "bricks", "materials", "mic")
+    """Scenes to render."""
+    size: int = 100
+    """Rows and columns of an image."""
+    num_train: int = 50
+    """Training views."""
+    num_val: int = 5
+    """Validation views."""
+    num_test: int = 10
+    """Test views."""
+    placement: Literal["centered", "padded", "shifted", "rotated"] = "centered"
+    """Where the object appears: in the center; there, but as small as in shifted; moved in the image plane (cx, cy in
+    the json); or off the center because the cameras look past it."""
+    offset: tuple[float, float] = (0.2, 0.15)
+    """How far the object is moved right and down, as fractions of the image (not for centered)."""
+    seed: int = 0
+    """Seed of the training and validation poses."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.synthetic.folder import make_scenes
+        from edge_se_sampler.engine.progress import Progress
+
+        with Progress(0, "rendering scenes") as progress:
+            paths = make_scenes(
+                self.out,
+                self.names,
+                size=self.size,
+                num_train=self.num_train,
+                num_val=self.num_val,
+                num_test=self.num_test,
+                placement=self.placement,
+                offset=self.offset,
+                seed=self.seed,
+                progress=progress.update,
+            )
+        for path in paths:
+            print(path)
+
+
+@dataclass(frozen=True)
+class Offcenter:
+    """Move the object of your own images off the center without changing a pixel: pad them, and write cx, cy."""
+
+    data: Path
+    """A Blender folder."""
+    out: Path
+    """Folder for centered/ (padded only) and shifted/; it must not exist, or be empty."""
+    shift: tuple[float, float] = (0.2, 0.15)
+    """How far the image is moved right and down, as fractions of its width and height; rounded to whole pixels."""
+    pad: tuple[float, float] | None = None
+    """Padding on the left and right, and on the top and bottom, as such fractions; by default as much as the shift."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.offcenter import offcenter
+        from edge_se_sampler.engine.progress import Progress
+
+        with Progress(0, "moving views off the center") as progress:
+            paths = offcenter(self.data, self.out, self.shift, self.pad, progress.update)
+        for path in paths:
+            print(path)
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a method on a Blender folder: edge-se train METHOD --data DIR."""
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Continue an interrupted run in place, under its own settings."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    max_seconds: float | None = None
+    """Stop this session after so many seconds."""
+
+    def run(self) -> None:
+        from edge_se_sampler.engine.run_folder import RunFolder
+        from edge_se_sampler.engine.session import prepare_resume
+
+        run = RunFolder(self.run_folder)
+        train(prepare_resume(run, run.config(method_configs()), self.max_seconds))
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Measure a run on its held-out views."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    output_path: Path = Path("eval.json")
+    """The json file to write."""
+    render_output_path: Path | None = None
+    """Folder for pictures of the views: ground truth on the left, rendering on the right."""
+
+    def run(self) -> None:
+        from edge_se_sampler.engine.reports import evaluate_run
+        from edge_se_sampler.engine.run_folder import RunFolder
+
+        run = RunFolder(self.run_folder)
+        results = evaluate_run(run, run.config(method_configs()), self.output_path, self.render_output_path)
+        print(f"PSNR {results['psnr']:.2f} dB over {results['num_images']} views; see {self.output_path}")
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a run as a video."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder."""
+    output_path: Path = Path("render.gif")
+    """The video to write, .gif or .mp4 (extra [video])."""
+    kind: Literal["spiral", "test"] = "spiral"
+    """Cameras on a spiral around the scene, or the held-out ones."""
+    num_frames: int = 60
+    """Frames of the spiral."""
+    frames_per_second: int = 20
+    """Frame rate of the video."""
+
+    def run(self) -> None:
+        from edge_se_sampler.engine.reports import render_run
+        from edge_se_sampler.engine.run_folder import RunFolder
+
+        run = RunFolder(self.run_folder)
+        config = run.config(method_configs())
+        render_run(run, config, self.output_path, self.kind, self.num_frames, self.frames_per_second)
+        print(self.output_path)
+
+
+@dataclass(frozen=True)
+class Show:
+    """Picture what a sampler does to your own images: view, probability of every pixel, and the pixels of a batch."""
+
+    data: Path
+    """A Blender folder."""
+    output_path: Path = Path("show.png")
+    """The picture to write."""
+    strategy: Literal["uniform", "precrop", "edge"] = "edge"
+    """Distribution that pixels are drawn from."""
+    num_views: int = 3
+    """Number of training views shown."""
+    seed: int = 0
+    """Seed of the drawn pixels."""
+    pixel_sampler: EdgeSEPixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
+    """Settings of the sampler."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.engine.files import check_output
+        from edge_se_sampler.engine.show import show
+
+        for flag, value in (
+            ("num-views", self.num_views),
+            ("pixel-sampler.num-rays-per-batch", self.pixel_sampler.num_rays_per_batch),
+        ):
+            if value < 1:
+                raise InputError(f"--{flag} is {value}: must be at least 1")
+        check_output(self.output_path)
+        views = read_blender(self.data, "train")
+        show(views, self.pixel_sampler, self.strategy, self.output_path, self.num_views, self.seed)
+        print(self.output_path)
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Print and picture where a scene can be occupied, and the sizes derived from its cameras and alpha."""
+
+    data: Path
+    """A Blender folder."""
+    output_path: Path = Path("inspect.png")
+    """The picture to write."""
+    near: float = LeanModelConfig.near
+    """Depth along the optical axis at which samples begin, world units."""
+    far: float = LeanModelConfig.far
+    """Depth at which samples end."""
+    voxel_size_px: float = LeanModelConfig.voxel_size_px
+    """Side of a grid cell, in widths of a pixel at the object's distance."""
+    step_size_voxels: float = LeanModelConfig.step_size_voxels
+    """Distance between samples, in sides of a grid cell."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.engine.files import check_output
+        from edge_se_sampler.engine.inspection import inspect
+
+        check_output(self.output_path)
+        config = LeanModelConfig(
+            near=self.near, far=self.far, voxel_size_px=self.voxel_size_px, step_size_voxels=self.step_size_voxels
+        )
+        check_fineness(config)
+        print(inspect(read_blender(self.data, "train"), config, self.output_path))
+        print(self.output_path)
+
+
+@dataclass(frozen=True)
+class Methods:
+    """List every method and the package that registered it."""
+
+    def run(self) -> None:
+        for name, method in registered_methods().items():
+            print(f"{name:<20} {method.specification.description}  [{method.origin}]")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Run the experiments and timings behind the published numbers."""
+
+
+COMMANDS: dict[str, type] = {
+    "demo": Demo,
+    "scenes": Scenes,
+    "offcenter": Offcenter,
+    "train": Train,
+    "resume": Resume,
+    "eval": Eval,
+    "render": Render,
+    "show": Show,
+    "inspect": Inspect,
+    "methods": Methods,
+    "bench": Bench,
+}
+
+
+def train(trainer: Any) -> None:
+    """Train, and say where the result is. Exits with 130 if it was stopped by Ctrl-C."""
+    from edge_se_sampler.engine.session import describe_run
+
+    print(describe_run(trainer), flush=True)
+    trainer.train()
+    resume = f"edge-se resume {trainer.run.path}"
+    if trainer.stop_requested:
+        print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
+        sys.exit(130)
+    print(f"{trainer.next_step} of {trainer.planned_steps} iterations in {trainer.elapsed:.1f} s of training")
+    print(f"measure it: edge-se eval {trainer.run.path}")
+    if trainer.next_step < trainer.planned_steps:
+        print(f"continue:   {resume}")
