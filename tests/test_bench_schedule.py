@@ -1,137 +1,172 @@
-"""The test of schedule auto: what is paired with what, and what the counts and intervals say."""
+"""The test of the adaptive schedule: what is paired with what, and what counts and intervals say."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench import runner as experiment
-from edge_se_sampler.bench.paper.trials import PRESETS, Preset
-from edge_se_sampler.bench.schedule import summary as summary_module
-from edge_se_sampler.bench.schedule import trials as cell_module
-from edge_se_sampler.bench.schedule.summary import best_shares, failures, lengths, table
+from edge_se_sampler.bench import runner
+from edge_se_sampler.bench.paper import trials as paper
+from edge_se_sampler.bench.schedule import trials as schedule
+from edge_se_sampler.bench.schedule.report import compare_lengths, describe, pair_failures
 from edge_se_sampler.bench.schedule.trials import (
-    FRACTIONS,
-    OF_LENGTHS,
-    Cell,
-    Scale,
-    choice_cells,
-    choice_seeds,
-    failure_cells,
-    length_cells,
-    settings_of,
+    LENGTHS,
+    SCENES_OF_LENGTHS,
+    SHARES,
+    Settings,
+    Trial,
+    best_shares,
+    build_config,
+    list_failure_trials,
+    list_length_trials,
+    selection_seeds,
 )
+
+COMMITTED = Path(__file__).parent.parent / "configs" / "schedule" / "result.json"
 
 
 def test_there_are_280_pairs() -> None:
-    every = failure_cells(Scale(), tuple(range(10)))
-    assert len(every) == len({*every}) == 2 * 280
-    pairs = {(cell.table, cell.scene, cell.seed) for cell in every}
-    assert len(pairs) == 280
-    assert {cell.arm for cell in every} == {"random", "auto"}
+    trials = list_failure_trials(Settings(), range(10))
+    assert len(trials) == len({*trials}) == 2 * 280
+    assert len({(trial.table, trial.scene, trial.seed) for trial in trials}) == 280
+    assert {trial.arm for trial in trials} == {"random", "adaptive"}
 
 
-def test_the_fixed_share_is_chosen_on_other_seeds() -> None:
-    choice = choice_cells(1000)
-    assert len(choice) == len({*choice}) == len(OF_LENGTHS) * 2 * 5
-    assert {cell.seed for cell in choice} == {100, 101}
-    assert {cell.seed for cell in choice_cells(10_000)} == {100}
-    assert {cell.arm for cell in choice} == {*FRACTIONS}
-    paired = length_cells(1000, "0.5", (0, 1, 2))
-    assert len(paired) == len({*paired}) == 3 * len(OF_LENGTHS) * 2
-    assert {(cell.iterations, cell.arm) for cell in paired} == {(1000, "0.5"), (1000, "auto")}
-    assert {cell.seed for cell in paired} == {0, 1, 2}
+def length_runs(adaptive: float, length: int = 300) -> list[dict[str, Any]]:
+    """On the seeds of selection 0.2 is best, on the others 0.5, by 1 dB."""
+    selection = {"0.02": 20.0, "0.05": 20.0, "0.1": 20.0, "0.2": 21.0, "0.5": 20.5}
+    reported = selection | {"0.5": 22.0, "adaptive": adaptive}
+    levels = dict.fromkeys(selection_seeds(length), selection) | dict.fromkeys((0, 1, 2), reported)
+    return [
+        {
+            "part": "lengths",
+            "table": table,
+            "scene": scene,
+            "iterations": length,
+            "arm": arm,
+            "seed": seed,
+            "psnr": psnr + (0.01 * seed if seed < 100 else 0.0),
+        }
+        for table, scene in SCENES_OF_LENGTHS
+        for seed, of_seed in levels.items()
+        for arm, psnr in of_seed.items()
+    ]
+
+
+def test_every_share_is_trained_on_the_seeds_of_selection_first() -> None:
+    trials = list_length_trials([], (0, 1, 2))
+    assert len(trials) == len({*trials}) == len(SCENES_OF_LENGTHS) * len(SHARES) * (2 + 2 + 2 + 1)
+    for length in LENGTHS:
+        of_length = [trial for trial in trials if trial.iterations == length]
+        assert {trial.arm for trial in of_length} == {*SHARES}
+        assert {trial.seed for trial in of_length} == {*selection_seeds(length)}
+
+
+def test_the_best_share_is_trained_beside_the_adaptive_schedule_on_other_seeds() -> None:
+    runs = [run for run in length_runs(21.0) if run["seed"] >= 100]
+    later = set(list_length_trials(runs, (0, 1, 2))) - set(list_length_trials([], (0, 1, 2)))
+    assert {(trial.iterations, trial.arm) for trial in later} == {(300, "0.2"), (300, "adaptive")}
+    assert len(later) == 3 * len(SCENES_OF_LENGTHS) * 2
+    assert {trial.seed for trial in later} == {0, 1, 2}
+    assert best_shares(runs[1:]) == {}  # one is still missing
 
 
 def test_arms_differ_in_the_schedule_alone() -> None:
     def config(arm: str) -> Any:
-        return settings_of(Cell("lengths", 2, "mic", 300, arm, 3), Path("d"), Path("o"))
+        return build_config(Trial("lengths", 2, "mic", 300, arm, 3), Path("d"), Path("o"))
 
-    auto, fixed, random = config("auto"), config("0.2"), config("random")
-    assert auto.pipeline.datamanager.pixel_sampler.schedule == "adaptive"
+    adaptive, fixed, random = config("adaptive"), config("0.2"), config("random")
+    assert adaptive.pipeline.datamanager.pixel_sampler.schedule == "adaptive"
     assert fixed.pipeline.datamanager.pixel_sampler.early_fraction == 0.2
-    assert auto.pipeline.model == fixed.pipeline.model == random.pipeline.model
-    assert (auto.reinit_dead, fixed.reinit_dead, random.reinit_dead) == (True, True, False)
-    assert (auto.max_num_iterations, auto.machine.seed) == (300, 3)
+    assert adaptive.pipeline.model == fixed.pipeline.model == random.pipeline.model
+    assert (adaptive.reinit_dead, fixed.reinit_dead, random.reinit_dead) == (True, True, False)
+    assert (adaptive.max_num_iterations, adaptive.machine.seed) == (300, 3)
     assert random.pipeline.datamanager.pixel_sampler.early == "uniform"
 
 
 def test_failures_are_counted_over_pairs() -> None:
-    def run(arm: str, seed: int, outcome: str, scene: str = "mic") -> dict[str, Any]:
-        return {
-            "part": "failures", "table": 2, "scene": scene, "arm": arm, "seed": seed, "outcome": outcome,
-            "psnr": 20.0, "revived": int(arm == "auto" and seed == 1),
-        }  # fmt: skip
+    def make_run(arm: str, seed: int, outcome: str) -> dict[str, Any]:
+        return {"part": "failures", "table": 2, "scene": "mic", "arm": arm, "seed": seed, "outcome": outcome}
 
-    runs = [run("random", seed, "background" if seed < 7 else "learnt") for seed in range(10)]
-    runs += [run("auto", seed, "slow" if seed == 0 else "learnt") for seed in range(9)]  # the tenth is not there yet
-    told = failures(runs)
-    assert (told["pairs"], told["random"], told["auto"], told["revived"]) == (9, 7, 1, 1)
-    assert told["configurations"] == [{"table": 2, "scene": "mic", "pairs": 9, "random": 7, "auto": 1}]
-    assert "Of 9 paired runs Random failed in 7, auto in 1 " in table({"failures": told, "lengths": []})
-    assert failures([]) == {}
+    runs = [make_run("random", seed, "collapsed" if seed < 7 else "converged") for seed in range(10)]
+    runs += [make_run("adaptive", seed, "underfit" if seed == 0 else "converged") for seed in range(9)]
+    pairs = pair_failures(runs)
+    assert [key[2] for key in pairs] == list(range(9))  # the tenth was not trained under the adaptive schedule
+    assert [sum(pair) for pair in zip(*pairs.values(), strict=True)] == [7, 1]
 
 
-def length_runs(auto: float) -> list[dict[str, Any]]:
-    """On the seeds of choice 0.2 is best, on the others 0.5, by 1 dB; auto is told."""
-    levels = {"0.02": 20.0, "0.05": 20.0, "0.1": 20.0, "0.2": 21.0, "0.5": 20.5}
-    others = levels | {"0.5": 22.0, "auto": auto}
-    return [
-        {"part": "lengths", "table": number, "scene": scene, "iterations": 300, "arm": arm, "seed": seed,
-         "psnr": level + (0.01 * seed if seed < 100 else 0.0)}
-        for number, scene in OF_LENGTHS
-        for seed, of in [*((seed, levels) for seed in choice_seeds(300)), *((seed, others) for seed in (0, 1, 2))]
-        for arm, level in of.items()
-    ]  # fmt: skip
+@pytest.mark.parametrize(("adaptive", "expected"), [(21.0, True), (20.9, True), (20.7, False), (22.0, True)])
+def test_the_adaptive_schedule_is_compared_with_the_share_selected_on_other_seeds(
+    adaptive: float, expected: bool
+) -> None:
+    (row,) = compare_lengths(length_runs(adaptive))
+    assert (row.iterations, row.best, row.summary.runs) == (300, "0.2", 12)
+    assert row.summary.mean == pytest.approx(adaptive - 21.0)
+    assert row.not_inferior == expected
 
 
-@pytest.mark.parametrize(("auto", "expected"), [(21.0, "yes"), (20.9, "yes"), (20.7, "no"), (22.0, "yes")])
-def test_auto_is_compared_with_the_share_chosen_on_other_seeds(auto: float, expected: str) -> None:
-    (row,) = lengths(length_runs(auto))
-    assert row["best"] == "0.2"
-    assert row["mean"] == pytest.approx(auto - 21.0)
-    assert row["runs"] == 12
-    last = table({"failures": {}, "lengths": [row]}).splitlines()[-1]
-    assert last.startswith("| 300 | 0.2 | ")
-    assert last.endswith(f"| 12 | {expected} |")
+# -- the command
 
 
-def test_the_command_runs_what_is_left(tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = Preset("tiny", iterations=4, info_iterations=3, rays=8, image_size=16, num_train=11, num_test=1)
-    monkeypatch.setitem(PRESETS, "cpu", small)
-    monkeypatch.setattr(experiment, "executor_of", lambda *_: lambda: ThreadPoolExecutor(1))
-    monkeypatch.setattr(cell_module, "SCENES", ("mic",))
-    monkeypatch.setattr(cell_module, "CONFIGURATIONS", (2, 6))
-    for module in (cell_module, summary_module):
-        monkeypatch.setattr(module, "LENGTHS", (3, 4))
-        monkeypatch.setattr(module, "OF_LENGTHS", ((2, "mic"),))
+def test_the_command_trains_in_stages_what_is_pending(
+    tmp_path: Path, edge_se: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = paper.Settings("tiny", iterations=4, info_iterations=3, rays=8, image_size=16, num_train=11, num_test=1)
+    monkeypatch.setitem(paper.PRESETS, "cpu", small)
+    monkeypatch.setattr(runner, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(schedule, "SCENES", ("mic",))
+    monkeypatch.setattr(schedule, "CONFIGURATIONS", (2, 6))
+    monkeypatch.setattr(schedule, "LENGTHS", (3, 4))
+    monkeypatch.setattr(schedule, "SCENES_OF_LENGTHS", ((2, "mic"),))
+    monkeypatch.setattr(schedule, "Settings", lambda: Settings(iterations=5))
     out = tmp_path / "out"
-    flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--failure-seeds", 0, "--length-seeds", 0]
+    flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--seeds", 0, "--length-seeds", 0]
     assert edge_se("bench", "schedule", *flags, "--parts", "failures").code == 0
     assert len(json.loads((out / "result.json").read_text())["runs"]) == 4
     answer = edge_se("bench", "schedule", *flags)
     assert answer.code == 0, answer
-    result = json.loads((out / "result.json").read_text())
-    assert len(result["runs"]) == 4 + (2 + 1) * 5 + 2 * 2
-    reported = [run for run in result["runs"] if run["part"] == "lengths" and run["seed"] == 0]
-    assert {run["arm"] for run in reported} == {"auto", *best_shares(result["runs"]).values()}
+    runs = json.loads((out / "result.json").read_text())["runs"]
+    assert len(runs) == 4 + (2 + 1) * len(SHARES) + 2 * 2
+    reported = {run["arm"] for run in runs if run["part"] == "lengths" and run["seed"] == 0}
+    assert reported == {"adaptive", *best_shares(runs).values()}
     assert (out / "lengths.png").stat().st_size > 0
-    assert result["failures"]["pairs"] == 2
-    assert "Of 2 paired runs" in (out / "table.md").read_text()
+    assert describe(out) == (out / "README.md").read_text()
+    assert "Of 2 pairs Random failed in " in describe(out)
 
 
-def test_nothing_to_do_is_refused(tmp_path: Path, edge_se: Any) -> None:
-    answer = edge_se("bench", "schedule", "--output-dir", tmp_path / "o", "--workers", 0)
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--workers", "0"), "at least one"),
+        (("--seeds",), "at least one"),
+        (("--length-seeds", "0", "100"), "selected on [100]"),
+    ],
+)
+def test_bad_choices_are_refused(
+    flags: tuple[str, ...], named: str, tmp_path: Path, edge_se: Callable[..., Any]
+) -> None:
+    answer = edge_se("bench", "schedule", "--output-dir", tmp_path / "o", *flags)
     assert answer.code == 2
-    assert "at least one" in answer.err
-
-
-def test_the_share_is_not_chosen_on_the_seeds_that_are_reported(tmp_path: Path, edge_se: Any) -> None:
-    answer = edge_se("bench", "schedule", "--output-dir", tmp_path / "o", "--length-seeds", 0, 100)
-    assert answer.code == 2
-    assert "chosen on [100]" in answer.err
+    assert named in answer.err
     assert not (tmp_path / "o").exists()
+
+
+# -- the committed result
+
+
+def test_the_adaptive_schedule_failed_in_none_of_280_trainings() -> None:
+    pairs = pair_failures(json.loads(COMMITTED.read_text())["runs"])
+    random, adaptive = (sum(pair[arm] for pair in pairs.values()) for arm in (0, 1))
+    assert (len(pairs), adaptive) == (280, 0)
+    assert random > 100
+
+
+def test_the_adaptive_schedule_is_not_inferior_to_the_best_fixed_length() -> None:
+    comparisons = compare_lengths(json.loads(COMMITTED.read_text())["runs"])
+    assert [row.iterations for row in comparisons] == [*LENGTHS]
+    assert all(row.not_inferior for row in comparisons)

@@ -80,6 +80,14 @@ def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDiffere
     return PairedDifference(mean, mean - reach * error, mean + reach * error, detectable, runs, better, len(means))
 
 
+def format_difference(difference: PairedDifference) -> str:
+    """The mean with its interval, where there is one."""
+    if not difference.runs:
+        return "–"
+    known = difference.low is not None
+    return f"{difference.mean:+.2f}" + (f" [{difference.low:+.2f}, {difference.high:+.2f}]" if known else "")
+
+
 def rank_correlation(first: Any, second: Any) -> float:
     """Spearman's correlation of two arrays of scores."""
     return float(require_scipy_stats().spearmanr(first, second).statistic)

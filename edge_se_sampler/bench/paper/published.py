@@ -1,15 +1,14 @@
-"""The paper's tables 1 to 4: PSNR in dB on NeRF's Blender scenes, one seed; its averages are truncated and left out.
+"""The paper's tables 1 to 4: PSNR in dB on NeRF's Blender scenes, one seed. Its averages are truncated and left out.
 
 Important Pixels Sampling for NeRF Training Based on Edge Values and Squared Errors, section 4.
 """
 
 from __future__ import annotations
 
+from edge_se_sampler.bench.strategies import LABELS
+
 SCENES = ("chair", "drums", "ficus", "hotdog", "bricks", "materials", "mic")
 """Its columns under the names of the synthetic scenes; bricks stands in for Lego."""
-STRATEGIES = ("vanilla-nerf", "precrop-nerf", "se-nerf", "precrop-se-nerf", "edge-nerf", "edge-se-nerf")
-"""Its rows: Random, Precrop + Random, SE, Precrop + SE, Edge, Edge + SE."""
-LABELS = ("Random", "Precrop + Random", "SE", "Precrop + SE", "Edge", "Edge + SE")
 
 _TABLES = {
     1: """13.69 23.94 14.26 36.63 31.97 29.82 13.12
@@ -42,4 +41,4 @@ _TABLES = {
 def published(table: int) -> dict[tuple[str, str], float]:
     """(strategy, scene) -> PSNR of a table, 1 to 4."""
     rows = [[float(number) for number in row.split()] for row in _TABLES[table].splitlines()]
-    return {(s, scene): rows[i][j] for i, s in enumerate(STRATEGIES) for j, scene in enumerate(SCENES)}
+    return {(name, scene): rows[i][j] for i, name in enumerate(LABELS) for j, scene in enumerate(SCENES)}

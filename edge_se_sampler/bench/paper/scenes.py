@@ -1,44 +1,26 @@
-"""The scenes that cells are trained on: made ones, or a NeRF-synthetic folder and its off-centre counterparts."""
+"""The scenes of the trials: synthetic ones, or a NeRF-synthetic folder and its off-centre counterparts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
-from edge_se_sampler.bench.paper.published import SCENES
-from edge_se_sampler.bench.paper.trials import TABLES, Cell, Placement, Preset
-from edge_se_sampler.data.blender import has_split
+from edge_se_sampler.data.blender import has_split, read_blender
 from edge_se_sampler.data.offcenter import offcenter
-from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
-from edge_se_sampler.data.synthetic.folder import make_scenes
+from edge_se_sampler.data.synthetic import ANALOG_OF
+from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
-
-DataOf = Callable[[Any], Path]
-"""A cell, of this bench or any that has a table and a scene -> its Blender folder."""
+from edge_se_sampler.sampling.edges import unit_float
 
 
-def synthetic_scenes(preset: Preset, cells: Sequence[Any], workplace: Path) -> DataOf:
-    """Make what the cells need and workplace/scenes does not have; where each cell's lies."""
-    placements: list[Placement] = sorted({TABLES[cell.table].placement for cell in cells})
-    for placement in placements:
-        folder = workplace / "scenes" / placement
-        wanted = {cell.scene for cell in cells if TABLES[cell.table].placement == placement}
-        missing = sorted(name for name in wanted if not (folder / name).exists())
-        if missing:
-            progress = Progress(len(missing) * (preset.num_train + 1 + preset.num_test), f"making {placement} scenes")
-            make_scenes(
-                folder, missing, size=preset.image_size or 800, num_train=preset.num_train, num_val=1,
-                num_test=preset.num_test, placement=placement, progress=lambda done, _, bar=progress: bar.update(done),
-            )  # fmt: skip
-            progress.close()
-    return lambda cell: workplace / "scenes" / TABLES[cell.table].placement / cell.scene
+def check_data(data: Path, scenes: Iterable[str]) -> None:
+    """Refuse a NeRF-synthetic folder that lacks a scene.
 
-
-def check_real(data: Path, cells: list[Cell]) -> None:
-    """Raises InputError where a scene that the cells need is not there."""
-    for scene in sorted({cell.scene for cell in cells}, key=SCENES.index):
+    Raises:
+        InputError: a scene's training or test split is not there.
+    """
+    for scene in scenes:
         for split in ("train", "test"):
             if not has_split(data / ANALOG_OF[scene], split):
                 raise InputError(
@@ -47,29 +29,31 @@ def check_real(data: Path, cells: list[Cell]) -> None:
                 )
 
 
-def real_scenes(data: Path, cells: list[Cell], workplace: Path) -> DataOf:
-    """A NeRF-synthetic folder's scenes; the padded and the shifted ones of `offcenter`, kept in workplace/scenes.
+def real_scene(data: Path, scene: str, placement: str, workplace: Path) -> Path:
+    """A scene of a NeRF-synthetic folder; padded or shifted, it is written to workplace/scenes/offcenter at first.
 
     Raises:
         InputError: bad data.
     """
-    moved = workplace / "scenes" / "offcenter"
-    for scene in sorted({cell.scene for cell in cells if TABLES[cell.table].placement != "centered"}):
-        if not (moved / scene).exists():
-            progress = Progress(0, f"moving {scene} off the centre")
+    if placement == "centered":
+        return data / ANALOG_OF[scene]
+    counterparts = workplace / "scenes" / "offcenter" / scene
+    if not counterparts.exists():
+        progress = Progress(0, f"moving {scene} off the centre")
 
-            def show(done: int, total: int, bar: Progress = progress) -> None:
-                bar.total = total
-                bar.update(done)
+        def update(done: int, total: int) -> None:
+            progress.total = total
+            progress.update(done)
 
-            offcenter(data / ANALOG_OF[scene], moved / scene, progress=show)
-            progress.close()
-    places = {"padded": "centered", "shifted": "shifted"}
+        offcenter(data / ANALOG_OF[scene], counterparts, progress=update)
+        progress.close()
+    return counterparts / {"padded": "centered", "shifted": "shifted"}[placement]
 
-    def data_of(cell: Cell) -> Path:
-        placement = TABLES[cell.table].placement
-        if placement == "centered":
-            return data / ANALOG_OF[cell.scene]
-        return moved / cell.scene / places[placement]
 
-    return data_of
+def save_examples(data: Path, views: Path, name: str) -> None:
+    """Write a scene's first training and test view to views/NAME-{train,test}.png, where they are not there yet."""
+    for split in ("train", "test"):
+        path = views / f"{name}-{split}.png"
+        if not path.exists():
+            views.mkdir(parents=True, exist_ok=True)
+            write_image(path, unit_float(read_blender(data, split).images[0]))

@@ -1,46 +1,46 @@
-"""Every claim of the paper, and some of ours, put to the runs: supported, not supported, or undecided.
+"""Every claim of the paper, and some of ours, tested by the runs: supported, not supported, or undecided.
 
-A comparison pairs runs of the same scene and seed. What the rules call a failure is in `bench.outcome`.
+A comparison pairs runs of the same scene and seed. What a failure is, `bench.outcomes` says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
-from edge_se_sampler.bench.paper.published import LABELS, STRATEGIES
-from edge_se_sampler.bench.paper.trials import PAPERS
-from edge_se_sampler.bench.statistics import paired_difference
+from edge_se_sampler.bench.outcomes import failed
+from edge_se_sampler.bench.paper.trials import PAPER_TABLES
+from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.statistics import PairedDifference, paired_difference
+from edge_se_sampler.bench.strategies import LABELS
 
-SEEDS = 3
-"""Fewer of a scene do not tell that it is hopeless."""
-WORTH = 0.3
-"""dB: a smaller difference is none; an undecided claim wants more runs until they could have shown this."""
-LABEL: dict[str, str] = dict(zip(STRATEGIES, LABELS, strict=True))
+MIN_SEEDS = 3
+"""Runs of a scene that it takes to say that most of them fail."""
+MIN_DIFFERENCE = 0.3
+"""dB: a smaller difference does not matter. An undecided claim needs more runs until they could show this one."""
 
 Arm = tuple[int, str]  # table, strategy
-Kind = Literal["better", "not worse", "rescues"]
+Kind = Literal["better", "not inferior", "prevents failures"]
 Verdict = Literal["supported", "not supported", "undecided", "nothing to compare"]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """`ours` against `theirs`, or that difference against another one."""
+    """An arm against a baseline, or that difference minus the difference of a second such pair."""
 
     label: str
-    ours: Arm
-    theirs: Arm
-    against: tuple[Arm, Arm] | None = None
+    arm: Arm
+    baseline: Arm
+    second_pair: tuple[Arm, ...] = ()
     measure: str = "psnr"
 
 
 @dataclass(frozen=True)
 class Claim:
-    """Holds if every one of its comparisons does that has anything to compare.
+    """Is supported if each of its comparisons is that has anything to compare.
 
-    "better": the interval lies above 0. "not worse": it lies above -0.3 dB, and there are no more failures.
-    "rescues": no run fails on a scene where most of the others' do.
+    "better": the interval lies above 0. "not inferior": it lies above -0.3 dB, and there are no more failures.
+    "prevents failures": no run fails on a scene where most of the baseline's do.
     """
 
     text: str
@@ -49,69 +49,96 @@ class Claim:
     comparisons: tuple[Comparison, ...]
 
 
-def _in_tables(tables: tuple[int, ...], ours: str, theirs: str, **more: Any) -> tuple[Comparison, ...]:
-    return tuple(Comparison(f"{_arms(ours, theirs)}, table {n}", (n, ours), (n, theirs), **more) for n in tables)
+@dataclass(frozen=True)
+class ComparedRuns:
+    """What the runs say of a comparison."""
+
+    comparison: Comparison
+    difference: PairedDifference
+    """Over the pairs in which not both runs failed."""
+    pairs: int
+    failures: int
+    baseline_failures: int
+    verdict: Verdict
 
 
-def _arms(ours: str, theirs: str) -> str:
-    return f"{LABEL[ours]} against {LABEL[theirs]}"
+@dataclass(frozen=True)
+class ClaimVerdict:
+    """What the runs say of a claim."""
+
+    claim: Claim
+    rows: list[ComparedRuns]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of its comparisons'."""
+        verdicts = {row.verdict for row in self.rows}
+        ordered: tuple[Verdict, ...] = ("not supported", "undecided", "supported", "nothing to compare")
+        return next(verdict for verdict in ordered if verdict in verdicts)
+
+
+def _against(arm: str, baseline: str) -> str:
+    return f"{LABELS[arm]} against {LABELS[baseline]}"
+
+
+def _in_tables(tables: tuple[int, ...], arm: str, baseline: str, measure: str = "psnr") -> tuple[Comparison, ...]:
+    label, note = _against(arm, baseline), " (edge band)" if measure == "edge_band_psnr" else ""
+    return tuple(Comparison(f"{label}, table {n}{note}", (n, arm), (n, baseline), measure=measure) for n in tables)
+
+
+def _gain_of_few_views(table: int, arm: str, baseline: str) -> Comparison:
+    label = f"{_against(arm, baseline)}: table {table} against table 1"
+    return Comparison(label, (table, arm), (table, baseline), ((1, arm), (1, baseline)))
+
+
+def _random_with(what: str, table: int, baseline_table: int) -> Comparison:
+    label = f"Random with {what}, table {table} against {baseline_table}"
+    return Comparison(label, (table, "vanilla-nerf"), (baseline_table, "vanilla-nerf"))
 
 
 WITH_SE = {"vanilla-nerf": "se-nerf", "precrop-nerf": "precrop-se-nerf", "edge-nerf": "edge-se-nerf"}
-EDGE, PRECROP, EDGE_SE = "edge-nerf", "precrop-nerf", "edge-se-nerf"
-
-
-def _gain(few: int, ours: str, theirs: str) -> Comparison:
-    return Comparison(
-        f"{_arms(ours, theirs)}: table {few} against table 1", (few, ours), (few, theirs), ((1, ours), (1, theirs))
-    )
-
-
-def _random_with(what: str, cured: int, plain: int) -> Comparison:
-    label = f"Random with {what}, table {cured} against {plain}"
-    return Comparison(label, (cured, "vanilla-nerf"), (plain, "vanilla-nerf"))
-
+EDGE, PRECROP, EDGE_SE, PRECROP_SE = "edge-nerf", "precrop-nerf", "edge-se-nerf", "precrop-se-nerf"
 
 CLAIMS = (
     Claim(
         "Where the object is centred, Edge is as stable as Precrop",
         "sections 4.2.1 and 4.3.1",
-        "not worse",
-        _in_tables((1, 3), EDGE, PRECROP) + _in_tables((1, 3), EDGE_SE, "precrop-se-nerf"),
+        "not inferior",
+        _in_tables((1, 3), EDGE, PRECROP) + _in_tables((1, 3), EDGE_SE, PRECROP_SE),
     ),
     Claim(
         "Off centre, Edge trains where Precrop fails",
         "sections 4.2.2 and 4.3.2",
-        "rescues",
-        _in_tables((2, 4), EDGE, PRECROP) + _in_tables((2, 4), EDGE_SE, "precrop-se-nerf"),
+        "prevents failures",
+        _in_tables((2, 4), EDGE, PRECROP) + _in_tables((2, 4), EDGE_SE, PRECROP_SE),
     ),
     Claim(
         "SE raises PSNR whatever the early phase, at equal steps",
         "section 4.2.1",
         "better",
-        tuple(row for early, late in WITH_SE.items() for row in _in_tables(tuple(PAPERS), late, early)),
+        tuple(row for early, late in WITH_SE.items() for row in _in_tables(tuple(PAPER_TABLES), late, early)),
     ),
     Claim(
         "SE raises PSNR whatever the early phase, at equal time",
         "ours",
         "better",
         tuple(
-            Comparison(f"{_arms(late, early)}, table {n + 8} against {n}", (n + 8, late), (n, early))
+            Comparison(f"{_against(late, early)}, table {n + 8} against {n}", (n + 8, late), (n, early))
             for early, late in WITH_SE.items()
-            for n in PAPERS
+            for n in PAPER_TABLES
         ),
     ),
     Claim(
         "With few views, Edge gains more over Precrop",
         "section 4.3.1",
         "better",
-        (_gain(3, EDGE, PRECROP), _gain(5, EDGE, PRECROP)),
+        (_gain_of_few_views(3, EDGE, PRECROP), _gain_of_few_views(5, EDGE, PRECROP)),
     ),
     Claim(
         "With few views, SE gains more",
         "abstract",
         "better",
-        (_gain(3, EDGE_SE, EDGE), _gain(5, EDGE_SE, EDGE)),
+        (_gain_of_few_views(3, EDGE_SE, EDGE), _gain_of_few_views(5, EDGE_SE, EDGE)),
     ),
     Claim(
         "Sobel edges are better than Laplacian ones",
@@ -126,113 +153,89 @@ CLAIMS = (
         _in_tables((1, 3), EDGE, PRECROP, measure="edge_band_psnr"),
     ),
     Claim(
-        "It is the place that defeats Precrop, not how small the object is",
+        "Precrop fails because of where the object is, not because it is small",
         "ours",
-        "rescues",
-        (Comparison("Precrop in the middle against off centre, table 16 against 2", (16, PRECROP), (2, PRECROP)),),
+        "prevents failures",
+        (Comparison("Precrop, small and centred against off centre, table 16 against 2", (16, PRECROP), (2, PRECROP)),),
     ),
     Claim(
-        "A softplus density alone cures Random",
+        "A softplus density alone keeps Random from failing",
         "ours",
-        "rescues",
-        tuple(_random_with("softplus against ReLU", cured, plain) for cured, plain in ((14, 1), (15, 2))),
+        "prevents failures",
+        tuple(_random_with("softplus against ReLU", *tables) for tables in ((14, 1), (15, 2))),
     ),
     Claim(
-        "Beginning dead networks anew cures Random",
+        "Reinitialising dead networks keeps Random from failing",
         "ours",
-        "rescues",
-        tuple(_random_with("dead networks anew against not", cured, plain) for cured, plain in ((17, 7), (18, 8))),
+        "prevents failures",
+        tuple(_random_with("dead networks reinitialised", *tables) for tables in ((17, 7), (18, 8))),
     ),
 )
 
 
-def verdicts(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the runs say of every claim that they have something to say of.
-
-    Returns:
-        text, source, verdict and `comparisons`: label, difference (dB; `PairedDifference`), failures of both
-        arms, verdict.
-    """
-    place = {(run["table"], run["strategy"], run["scene"], run["seed"]): run for run in runs}
-    told = []
+def evaluate_claims(runs: list[Run]) -> list[ClaimVerdict]:
+    """What the runs say of every claim for which there are pairs of runs."""
+    by_key = {(run["table"], run["strategy"], run["scene"], run["seed"]): run for run in runs}
+    verdicts = []
     for claim in CLAIMS:
-        rows = [row for comparison in claim.comparisons for row in _compared(comparison, claim.kind, place)]
+        rows = [row for comparison in claim.comparisons if (row := _compare(comparison, claim.kind, by_key))]
         if rows:
-            verdict = _all([row["verdict"] for row in rows])
-            told.append({"text": claim.text, "source": claim.source, "verdict": verdict, "comparisons": rows})
-    return told
+            verdicts.append(ClaimVerdict(claim, rows))
+    return verdicts
 
 
-def _all(parts: list[Verdict]) -> Verdict:
-    parts = [part for part in parts if part != "nothing to compare"] or ["nothing to compare"]
-    if "not supported" in parts:
-        return "not supported"
-    return "undecided" if "undecided" in parts else parts[0]
-
-
-def _compared(comparison: Comparison, kind: Kind, place: dict[Any, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The comparison's row, if there are pairs."""
-    arms = [comparison.ours, comparison.theirs, *(comparison.against or ())]
-    where = sorted((scene, seed) for (table, name, scene, seed) in place if (table, name) == comparison.ours)
-    groups = [[place[arm + at] for arm in arms if arm + at in place] for at in where]
-    pairs = [pair for pair in groups if len(pair) == len(arms) and all(run[comparison.measure] for run in pair)]
+def _compare(comparison: Comparison, kind: Kind, by_key: dict[Any, Run]) -> ComparedRuns | None:
+    arms = (comparison.arm, comparison.baseline, *comparison.second_pair)
+    scene_seeds = sorted((scene, seed) for (table, name, scene, seed) in by_key if (table, name) == comparison.arm)
+    groups = [[by_key[arm + scene_seed] for arm in arms if arm + scene_seed in by_key] for scene_seed in scene_seeds]
+    pairs = [runs for runs in groups if len(runs) == len(arms) and all(run[comparison.measure] for run in runs)]
     if not pairs:
-        return
-    failures = [sum(failed(pair[i]) for pair in pairs) for i in (0, 1)]
-    telling = [pair for pair in pairs if not _both_failed(pair)]
-    difference = paired_difference([(pair[0]["scene"], _difference(pair, comparison.measure)) for pair in telling])
-    if kind == "rescues":
-        verdict = _rescued(pairs)
-    elif not telling:
+        return None
+    failures, baseline_failures = (sum(failed(runs[i]) for runs in pairs) for i in (0, 1))
+    informative = [runs for runs in pairs if not _both_failed(runs)]
+    difference = paired_difference((runs[0]["scene"], _difference(runs, comparison.measure)) for runs in informative)
+    if kind == "prevents failures":
+        verdict = _prevented(pairs)
+    elif not informative:
         verdict = "nothing to compare"
     else:
-        verdict = _judged(kind, difference.low, difference.high, difference.detectable)
-        if kind == "not worse" and failures[0] > failures[1]:
-            verdict = "undecided" if verdict == "supported" else verdict
-    yield {
-        "label": comparison.label,
-        "measure": comparison.measure,
-        **asdict(difference),
-        "pairs": len(pairs),
-        "failures": failures[0],
-        "their_failures": failures[1],
-        "verdict": verdict,
-    }
+        verdict = _judge_interval(kind, difference)
+        if kind == "not inferior" and failures > baseline_failures and verdict == "supported":
+            verdict = "undecided"
+    return ComparedRuns(comparison, difference, len(pairs), failures, baseline_failures, verdict)
 
 
-def _both_failed(pair: list[dict[str, Any]]) -> bool:
-    """Two dead runs show the same background: that says nothing of how good either way of sampling is."""
-    return any(failed(ours) and failed(theirs) for ours, theirs in zip(pair[::2], pair[1::2], strict=True))
+def _both_failed(runs: list[Run]) -> bool:
+    """Two failed runs show the same background: that says nothing about how good either way of sampling is."""
+    return any(failed(run) and failed(baseline) for run, baseline in zip(runs[::2], runs[1::2], strict=True))
 
 
-def _difference(pair: list[dict[str, Any]], measure: str) -> float:
-    values = [run[measure] for run in pair]
+def _difference(runs: list[Run], measure: str) -> float:
+    values = [run[measure] for run in runs]
     return values[0] - values[1] - (values[2] - values[3] if values[2:] else 0.0)
 
 
-def failed(run: dict[str, Any]) -> bool:
-    """Whether a run got nowhere."""
-    return run["outcome"] != "learnt"
-
-
-def _judged(kind: Kind, low: float | None, high: float | None, detectable: float | None) -> Verdict:
-    if low is None or high is None or detectable is None:
+def _judge_interval(kind: Kind, difference: PairedDifference) -> Verdict:
+    if difference.low is None or difference.high is None or difference.detectable is None:
         return "undecided"
-    bound = -WORTH if kind == "not worse" else 0.0
-    if low > bound:
+    bound = -MIN_DIFFERENCE if kind == "not inferior" else 0.0
+    if difference.low > bound:
         return "supported"
-    if high <= bound or (kind == "better" and detectable < WORTH):
+    if difference.high <= bound or (kind == "better" and difference.detectable < MIN_DIFFERENCE):
         return "not supported"
     return "undecided"
 
 
-def _rescued(pairs: list[list[dict[str, Any]]]) -> Verdict:
-    """On the scenes where most of the others' runs fail: does any of ours?"""
+def _prevented(pairs: list[list[Run]]) -> Verdict:
+    """On the scenes where most of the baseline's runs fail: does any of the arm's?"""
     by_scene: dict[str, list[tuple[bool, bool]]] = {}
-    for ours, theirs in pairs:
-        by_scene.setdefault(ours["scene"], []).append((failed(ours), failed(theirs)))
-    judged = [runs for runs in by_scene.values() if len(runs) >= SEEDS]
-    hopeless = [runs for runs in judged if 2 * sum(theirs for _, theirs in runs) > len(runs)]
-    if not hopeless:
+    for run, baseline in pairs:
+        by_scene.setdefault(run["scene"], []).append((failed(run), failed(baseline)))
+    hard = [
+        outcomes
+        for outcomes in by_scene.values()
+        if len(outcomes) >= MIN_SEEDS and 2 * sum(baseline for _, baseline in outcomes) > len(outcomes)
+    ]
+    if not hard:
         return "undecided"
-    return "not supported" if any(ours for runs in hopeless for ours, _ in runs) else "supported"
+    return "not supported" if any(arm for outcomes in hard for arm, _ in outcomes) else "supported"

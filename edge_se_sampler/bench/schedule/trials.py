@@ -1,40 +1,44 @@
-"""What schedule "adaptive" is put to: does any seed fail under it, and is it as good as a well chosen fixed length.
+"""The trainings that test the adaptive schedule: does one fail, and is it as good as the best fixed early phase.
 
-arm   Random; Edge + SE with dead networks reinitialised, under the adaptive schedule or a fixed share of the iterations
+arm   "random": Random. "adaptive": Edge + SE under the adaptive schedule, dead networks reinitialized.
+      "0.02" ... "0.5": the same with an early phase of that share of the iterations
 """
 
 from __future__ import annotations
 
+import statistics
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from edge_se_sampler.bench.overrides import SAMPLER, override
+from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import SCENES
-from edge_se_sampler.bench.paper.trials import PRESETS, config_of
-from edge_se_sampler.bench.paper.trials import Cell as PaperCell
-from edge_se_sampler.bench.train import trial
+from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.train import train_and_measure
 from edge_se_sampler.engine.config import TrainerConfig
 
 Part = Literal["failures", "lengths"]
-FRACTIONS = ("0.02", "0.05", "0.1", "0.2", "0.5")
+SHARES = ("0.02", "0.05", "0.1", "0.2", "0.5")
 CONFIGURATIONS = (1, 2, 5, 6)
-"""The paper bench's tables of NeRF: centred or off centre, all views or ten."""
+"""Tables of `bench paper`: NeRF with all views or ten, centred or off centre."""
 LENGTHS = (300, 1000, 3000, 10_000)
-OF_LENGTHS = ((1, "drums"), (1, "bricks"), (2, "chair"), (2, "mic"))
+SCENES_OF_LENGTHS = ((1, "drums"), (1, "bricks"), (2, "chair"), (2, "mic"))
 """Table and scene; two centred, two off centre."""
 
 
 @dataclass(frozen=True)
-class Scale:
-    """How large the experiment is; the rest is the paper bench's cpu preset."""
+class Settings:
+    """How large the experiment is; the rest is `bench paper`'s cpu preset."""
 
     iterations: int = 500
-    """Of the runs that may fail."""
+    """Of the part "failures"."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class Trial:
     """One training."""
 
     part: Part
@@ -46,50 +50,72 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """A name for its folder."""
+        """Of its run folder."""
         return "-".join(map(str, asdict(self).values()))
 
 
-def failure_cells(scale: Scale, seeds: tuple[int, ...]) -> list[Cell]:
-    """Random and auto, paired: 28 configurations, seed by seed."""
-    every = product(seeds, CONFIGURATIONS, SCENES, ("random", "auto"))
-    return [Cell("failures", table, scene, scale.iterations, arm, seed) for seed, table, scene, arm in every]
+def list_failure_trials(settings: Settings, seeds: Sequence[int]) -> list[Trial]:
+    """Random and the adaptive schedule in 28 configurations, paired seed by seed."""
+    every = product(seeds, CONFIGURATIONS, SCENES, ("random", "adaptive"))
+    return [Trial("failures", table, scene, settings.iterations, arm, seed) for seed, table, scene, arm in every]
 
 
-def choice_cells(length: int) -> list[Cell]:
-    """Every fixed share of a planned length, on its seeds of choice."""
-    every = product(choice_seeds(length), OF_LENGTHS, FRACTIONS)
-    return [Cell("lengths", table, scene, length, share, seed) for seed, (table, scene), share in every]
+def list_length_trials(runs: list[Run], seeds: Sequence[int]) -> list[Trial]:
+    """Every fixed share of every planned length on the seeds of selection; where all of those have been trained, the
+    best share and the adaptive schedule, paired, on the seeds that are reported."""
+    trials = []
+    for length in LENGTHS:
+        trials += _list_length_trials(length, SHARES, selection_seeds(length))
+        best = best_shares(runs).get(length)
+        if best is not None:
+            trials += _list_length_trials(length, (best, "adaptive"), seeds)
+    return trials
 
 
-def length_cells(length: int, share: str, seeds: tuple[int, ...]) -> list[Cell]:
-    """Auto and a fixed share of a planned length, paired."""
-    every = product(seeds, OF_LENGTHS, (share, "auto"))
-    return [Cell("lengths", table, scene, length, arm, seed) for seed, (table, scene), arm in every]
+def _list_length_trials(length: int, arms: Sequence[str], seeds: Sequence[int]) -> list[Trial]:
+    every = product(seeds, SCENES_OF_LENGTHS, arms)
+    return [Trial("lengths", table, scene, length, arm, seed) for seed, (table, scene), arm in every]
 
 
-def choice_seeds(length: int) -> tuple[int, ...]:
-    """The fixed share is chosen on these: two, but one where a training is long."""
+def selection_seeds(length: int) -> tuple[int, ...]:
+    """Seeds on which the fixed share is selected: two, but one where a training is long."""
     return (100, 101) if length < LENGTHS[-1] else (100,)
 
 
-def settings_of(cell: Cell, data: Path, output_dir: Path) -> TrainerConfig:
-    """What a cell trains."""
-    strategy = "vanilla-nerf" if cell.arm == "random" else "edge-se-nerf"
-    preset = replace(PRESETS["cpu"], iterations=cell.iterations)
-    config = config_of(PaperCell(cell.table, cell.scene, strategy, cell.seed), preset, data, output_dir)
-    config = replace(config, experiment_name=cell.name)
-    if cell.arm == "random":
-        return config
-    manager = config.pipeline.datamanager
-    changes: dict[str, Any] = {"schedule": "adaptive"} if cell.arm == "auto" else {"early_fraction": float(cell.arm)}
-    manager = replace(manager, pixel_sampler=replace(manager.pixel_sampler, **changes))
-    return replace(config, pipeline=replace(config.pipeline, datamanager=manager), reinit_dead=True)
+def score_shares(runs: list[Run]) -> dict[int, dict[str, float]]:
+    """Planned length -> fixed share -> mean PSNR on the seeds of selection; only lengths of which all are trained."""
+    scores = {}
+    for length in LENGTHS:
+        keys = [(table, scene, seed) for seed in selection_seeds(length) for table, scene in SCENES_OF_LENGTHS]
+        psnrs = {
+            (run["arm"], run["table"], run["scene"], run["seed"]): run["psnr"]
+            for run in runs
+            if run["part"] == "lengths" and run["iterations"] == length
+        }
+        if all((share, *key) in psnrs for share in SHARES for key in keys):
+            scores[length] = {share: statistics.mean(psnrs[(share, *key)] for key in keys) for share in SHARES}
+    return scores
 
 
-def run_cell(cell: Cell, data: Path, output_dir: Path) -> dict[str, Any]:
-    """Train a cell and measure it; runs in a process of its own."""
-    measured = trial(settings_of(cell, data, output_dir))
-    for bulky in ("loss", "loss_every", "view"):
-        del measured[bulky]
-    return asdict(cell) | measured
+def best_shares(runs: list[Run]) -> dict[int, str]:
+    """Planned length -> the fixed share with the highest PSNR on the seeds of selection."""
+    return {length: max(scores, key=scores.__getitem__) for length, scores in score_shares(runs).items()}
+
+
+def build_config(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
+    """What a trial trains."""
+    strategy = "vanilla-nerf" if trial.arm == "random" else "edge-se-nerf"
+    settings = replace(paper.PRESETS["cpu"], iterations=trial.iterations)
+    paper_trial = paper.Trial(trial.table, trial.scene, strategy, trial.seed)
+    changes: dict[str, Any] = {"experiment_name": trial.name}
+    if trial.arm == "adaptive":
+        changes |= {f"{SAMPLER}.schedule": "adaptive", "reinit_dead": True}
+    elif trial.arm != "random":
+        changes |= {f"{SAMPLER}.early_fraction": float(trial.arm), "reinit_dead": True}
+    return override(paper.build_config(paper_trial, settings, data, output_dir), changes)
+
+
+def run_trial(trial: Trial, data: Path, output_dir: Path) -> Run:
+    """Train a trial and measure it."""
+    run = train_and_measure(build_config(trial, data, output_dir))
+    return {key: value for key, value in run.items() if key not in ("loss", "loss_every")}

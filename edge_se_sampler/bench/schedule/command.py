@@ -1,0 +1,54 @@
+"""`edge-se bench schedule`. Torch-free until it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.errors import InputError
+
+if TYPE_CHECKING:
+    from edge_se_sampler.bench.runner import Experiment, Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchSchedule(ExperimentCommand):
+    """Test the adaptive schedule: failures, paired with Random's, and PSNR against the best fixed early phase. Writes
+    result.json, README.md and lengths.png; resumes."""
+
+    parts: tuple[Literal["failures", "lengths"], ...] = ("failures", "lengths")
+    """Which of the two tests."""
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Of the test of failures."""
+    length_seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the comparison with fixed early phases, over planned lengths; the best fixed one is selected on others."""
+
+    def experiment(self) -> Experiment:
+        from edge_se_sampler.bench.paper.trials import PRESETS, synthetic_scene
+        from edge_se_sampler.bench.runner import Experiment
+        from edge_se_sampler.bench.schedule.trials import (
+            LENGTHS,
+            Settings,
+            Trial,
+            list_failure_trials,
+            list_length_trials,
+            run_trial,
+            selection_seeds,
+        )
+
+        if not (self.parts and self.length_seeds):
+            raise InputError("--parts and --length-seeds: give at least one of each")
+        if overlap := sorted(set(self.length_seeds) & set(selection_seeds(LENGTHS[0]))):
+            raise InputError(f"--length-seeds: the fixed phase is selected on {overlap}; name others")
+        settings = Settings()
+
+        def trials(runs: list[Run]) -> list[Trial]:
+            failures = list_failure_trials(settings, self.seeds) if "failures" in self.parts else []
+            return failures + (list_length_trials(runs, self.length_seeds) if "lengths" in self.parts else [])
+
+        def arguments(trial: Trial) -> tuple[object, ...]:
+            data = synthetic_scene(trial.table, trial.scene, PRESETS["cpu"], self.workplace)
+            return data, self.workplace / "runs"
+
+        return Experiment("schedule", settings, trials, run_trial, arguments)

@@ -1,0 +1,308 @@
+"""The runner of experiments: what is kept, what is trained again, and what killed or interrupted processes cost."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge_se_sampler.bench.runner import (
+    Experiment,
+    Run,
+    executor_factory,
+    list_trials,
+    run_experiment,
+    run_in_subprocess,
+)
+from edge_se_sampler.errors import InputError
+
+
+@dataclass(frozen=True)
+class ToySettings:
+    steps: int = 3
+
+
+@dataclass(frozen=True)
+class ToyTrial:
+    scene: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene}-{self.seed}"
+
+
+TRIALS = [ToyTrial("mic", seed) for seed in range(3)]
+
+
+def train(trial: ToyTrial, *_: Any) -> Run:
+    return {"psnr": 20.0 + trial.seed}
+
+
+def toy_experiment(
+    train: Callable[..., Run] = train,
+    trials: Callable[[list[Run]], list[ToyTrial]] = lambda _: TRIALS,
+    steps: int = 3,
+    arguments: tuple[Any, ...] = (),
+) -> Experiment:
+    return Experiment("toy", ToySettings(steps), trials, train, lambda _: arguments)
+
+
+def one_thread() -> Executor:
+    return ThreadPoolExecutor(1)
+
+
+def read(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "result.json").read_text())
+
+
+# -- what is kept
+
+
+def test_result_json_holds_the_head_and_every_run_sorted(tmp_path: Path) -> None:
+    result = run_experiment(toy_experiment(trials=lambda _: TRIALS[::-1]), tmp_path / "new", one_thread)
+    assert read(tmp_path / "new") == json.loads(json.dumps(result))
+    assert result["runs"] == [{"scene": "mic", "seed": seed, "psnr": 20.0 + seed} for seed in range(3)]
+    assert (result["version"], result["experiment"], result["settings"]) == (2, "toy", {"steps": 3})
+    assert result["command"].startswith("edge-se ")
+    assert result["errors"] == []
+
+
+def test_a_later_call_trains_only_what_is_pending(tmp_path: Path) -> None:
+    trained = []
+
+    def count(trial: ToyTrial) -> Run:
+        trained.append(trial)
+        return train(trial)
+
+    run_experiment(toy_experiment(count, lambda _: TRIALS[:1]), tmp_path, one_thread)
+    run_experiment(toy_experiment(count, lambda _: [*TRIALS, *TRIALS]), tmp_path, one_thread)
+    assert trained == TRIALS
+
+
+def test_later_trials_may_depend_on_earlier_runs(tmp_path: Path) -> None:
+    def trials(runs: list[Run]) -> list[ToyTrial]:
+        best = max((run["seed"] for run in runs if run["scene"] == "mic"), default=None)
+        return TRIALS if best is None else [*TRIALS, ToyTrial("chair", best)]
+
+    result = run_experiment(toy_experiment(trials=trials), tmp_path, one_thread)
+    assert [(run["scene"], run["seed"]) for run in result["runs"]] == [("chair", 2), ("mic", 0), ("mic", 1), ("mic", 2)]
+
+
+def test_a_failing_trial_is_reported_stops_no_other_and_is_tried_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail_once(trial: ToyTrial) -> Run:
+        if trial.seed == 1 and not (tmp_path / "failed").exists():
+            (tmp_path / "failed").touch()
+            raise FloatingPointError("the loss is not finite at step 3")
+        return train(trial)
+
+    result = run_experiment(toy_experiment(fail_once), tmp_path, one_thread)
+    assert [run["seed"] for run in result["runs"]] == [0, 2]
+    assert result["errors"] == [
+        {"scene": "mic", "seed": 1, "error": "FloatingPointError: the loss is not finite at step 3"}
+    ]
+    assert "mic, 1, FloatingPointError: the loss is not finite at step 3" in capsys.readouterr().out
+    again = run_experiment(toy_experiment(fail_once), tmp_path, one_thread)
+    assert [run["seed"] for run in again["runs"]] == [0, 1, 2]
+    assert again["errors"] == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{}",
+        "[]",
+        '{"version": 1, "experiment": "toy", "settings": {"steps": 3}, "machine": {}, "runs": [], "errors": []}',
+        '{"version": 2, "experiment": "toy", "settings": {"steps": 3}, "machine": {}, "runs": 3, "errors": []}',
+        '{"version": 2, "experiment": "toy", "settings": {"steps": 3}, "machine": {}, "runs": [7], "errors": []}',
+        '{"version": 2, "experiment": "other", "settings": {"steps": 3}, "machine": {}, "runs": [], "errors": []}',
+        '{"version": 2, "experiment": "toy", "settings": {"steps": 4}, "machine": {}, "runs": [], "errors": []}',
+    ],
+)
+def test_a_file_that_is_no_result_of_the_experiment_is_refused_and_kept(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=r"result\.json"):
+        run_experiment(toy_experiment(), tmp_path, one_thread)
+    assert path.read_text() == content
+
+
+def test_listing_trials_trains_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_experiment(toy_experiment(trials=lambda _: TRIALS[:1]), tmp_path, one_thread)
+    before = (tmp_path / "result.json").read_bytes()
+    list_trials(toy_experiment(lambda _: pytest.fail("trained")), tmp_path)
+    assert capsys.readouterr().out.endswith("mic-0\nmic-1\nmic-2\n3 trainings, 2 of them pending\n")
+    assert (tmp_path / "result.json").read_bytes() == before
+    list_trials(toy_experiment(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+# -- processes
+
+
+def die_once(trial: ToyTrial, folder: Path) -> Run:
+    """Kills its process the first time."""
+    mark = folder / "died"
+    if trial.seed == 1 and not mark.exists():
+        mark.touch()
+        os._exit(9)
+    return train(trial)
+
+
+def test_a_killed_worker_costs_no_trial(tmp_path: Path) -> None:
+    result = run_experiment(
+        toy_experiment(die_once, arguments=(tmp_path,)), tmp_path, executor_factory(workers=1, scheduler=None)
+    )
+    assert (tmp_path / "died").exists()
+    assert [run["seed"] for run in result["runs"]] == [0, 1, 2]
+    assert result["errors"] == []
+
+
+def test_a_training_killed_in_a_process_of_its_own_is_an_error_of_that_trial_alone(tmp_path: Path) -> None:
+    def kill_one(trial: ToyTrial) -> Run:
+        return run_in_subprocess(os._exit, 1) if trial.seed == 1 else train(trial)
+
+    result = run_experiment(toy_experiment(kill_one), tmp_path, one_thread)
+    assert [run["seed"] for run in result["runs"]] == [0, 2]
+    (error,) = result["errors"]
+    assert error["error"] == "RuntimeError: its process was killed; is there too little memory?"
+
+
+def interrupt_this_process() -> int:
+    os.kill(os.getpid(), signal.SIGINT)
+    return 7
+
+
+def test_workers_ignore_ctrl_c() -> None:
+    """Every process of a terminal gets the signal: a worker that answered it would print a traceback."""
+    with executor_factory(1, None)() as executor:
+        assert executor.submit(interrupt_this_process).result() == 7
+
+
+class ExecutorWithoutCancel(ThreadPoolExecutor):
+    """As dask's executor: `shutdown` takes no cancel_futures."""
+
+    def shutdown(self, wait: bool = True) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().shutdown(wait=wait)
+
+
+def test_an_interruption_keeps_what_is_finished_whatever_the_executor(tmp_path: Path) -> None:
+    def interrupt_second(trial: ToyTrial) -> Run:
+        if trial.seed == 1:
+            raise KeyboardInterrupt
+        return train(trial)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(toy_experiment(interrupt_second), tmp_path, partial(ExecutorWithoutCancel, 1))
+    assert [run["seed"] for run in read(tmp_path)["runs"]] == [0]
+
+
+INTERRUPTED = """
+import os, pathlib, signal, time
+from test_bench_runner import executor_factory, run_experiment, toy_experiment
+
+def interrupt_parent_and_sleep(trial):
+    os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(600)
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, where a shell started the tests with &
+    run_experiment(toy_experiment(interrupt_parent_and_sleep), pathlib.Path("."), executor_factory(1, None))
+"""
+
+
+def run_script(code: str, folder: Path) -> subprocess.Popen[str]:
+    """A script in a process of its own, which can import this module."""
+    (folder / "script.py").write_text(code)
+    paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    return subprocess.Popen(
+        [sys.executable, "script.py"],
+        cwd=folder,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+    )
+
+
+def test_ctrl_c_waits_for_no_trial(tmp_path: Path) -> None:
+    with run_script(INTERRUPTED, tmp_path) as process:
+        _, errors = process.communicate(timeout=120)  # a trial sleeps for longer
+    assert "KeyboardInterrupt" in errors
+
+
+STARTS_A_WORKER = """
+import os, time
+from edge_se_sampler.bench.runner import executor_factory
+if __name__ == "__main__":
+    executor = executor_factory(1, None)()
+    print(executor.submit(os.getpid).result(), flush=True)
+    time.sleep(600)
+"""
+STARTS_A_SUBPROCESS = """
+import os, pathlib, time
+from edge_se_sampler.bench.runner import run_in_subprocess
+def tell_and_sleep():
+    print(os.getpid(), flush=True)
+    time.sleep(600)
+if __name__ == "__main__":
+    run_in_subprocess(tell_and_sleep)
+"""
+
+
+@pytest.mark.parametrize("code", [STARTS_A_WORKER, STARTS_A_SUBPROCESS])
+def test_workers_do_not_outlive_a_killed_parent(code: str, tmp_path: Path) -> None:
+    with run_script(code, tmp_path) as process:
+        assert process.stdout is not None
+        worker = int(process.stdout.readline())
+        os.kill(worker, 0)
+        process.kill()
+    for _ in range(100):
+        if not is_running(worker):
+            return
+        time.sleep(0.1)
+    raise AssertionError(f"worker {worker} is still there")
+
+
+def is_running(process: int) -> bool:
+    """A zombie, which its new parent has not looked at yet, is not."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{process}/stat")
+    return not (status.exists() and ") Z " in status.read_text())
+
+
+# -- a dask cluster
+
+
+def test_an_address_where_no_scheduler_answers_is_refused() -> None:
+    pytest.importorskip("distributed", reason="needs the [cluster] extra")
+    with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no dask scheduler answers"):
+        executor_factory(1, "tcp://127.0.0.1:9")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_a_cluster_costs_no_trial(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="needs the [cluster] extra")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        factory = executor_factory(1, cluster.scheduler_address)
+        result = run_experiment(toy_experiment(die_once, arguments=(tmp_path,)), tmp_path, factory)
+    assert (tmp_path / "died").exists()
+    assert [run["seed"] for run in result["runs"]] == [0, 1, 2]
+    assert result["errors"] == []
