@@ -68,8 +68,14 @@ class ExperimentCommand(ABC):
 
     def executor(self) -> Callable[[], Executor]:
         """What makes the executor that --workers or --scheduler name."""
-        from edge_se_sampler.bench.runner import default_workers, executor_factory
+        from edge_se_sampler.bench.runner import executor_factory
 
         if self.workers is not None and self.workers < 1:
             raise InputError(f"--workers is {self.workers}: give at least one")
-        return executor_factory(self.workers or default_workers(), self.scheduler)
+        return executor_factory(self.workers or self.default_workers(), self.scheduler)
+
+    def default_workers(self) -> int:
+        """How many trainings at once if --workers is left out."""
+        from edge_se_sampler.bench.runner import default_workers
+
+        return default_workers()

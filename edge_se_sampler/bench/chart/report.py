@@ -1,58 +1,347 @@
-"""The chart as a page that stands alone."""
+"""The chart's README.md, pictures, and table of methods for other texts."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from html import escape
+import shlex
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.chart.summary import RECOMMENDED, rows_of, rows_of_others
-from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS
-from edge_se_sampler.bench.page import figure, grid, page
+from edge_se_sampler.bench.baselines.results import name_of, read_baselines
+from edge_se_sampler.bench.chart.figures import MIB, draw_chart, draw_costs, draw_parts, draw_scenes
+from edge_se_sampler.bench.chart.summary import (
+    END,
+    always_better,
+    baseline_runs,
+    comparable,
+    comparable_groups,
+    differences,
+    mean_psnr_at,
+    runs_of,
+    scenes_of,
+    upper_envelope,
+)
+from edge_se_sampler.bench.chart.trials import ChartSettings
+from edge_se_sampler.bench.chart.variants import COMPARISONS, GROUPS, RECOMMENDED, TOP, VARIANTS, Group
+from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN, failed
+from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.tables import decimals, describe_machine, markdown_table
+from edge_se_sampler.engine.figures import save_figure
 
-TITLE = "NeRF on a plain CPU: speed against accuracy"
 CAPTIONS = {
-    "chart": "Methods, what scores squared errors, and other programs (dotted): test PSNR against training time.",
-    "parts": "lean-nerf with one thing changed at a time.",
-    "costs": "The same runs against how often networks were asked, and against memory.",
-    "scenes": "Every scene, every seed; a cross: training failed.",
+    "chart": "Test PSNR against training time: methods, error sources (dashed) and other programs (dotted)",
+    "scenes": "Test PSNR against training time on every scene, a line a seed; a cross: training failed",
+    "parts": "lean-nerf with one thing changed at a time",
+    "costs": "Test PSNR against network queries and against memory",
 }
+NOTES = "notes.md"
+"""Remarks by hand, which no number of the result shows; appended to the README where there are any."""
 
 
-def report(result: dict[str, Any], pictures: Sequence[Path]) -> str:
-    """The page.
+def draw(folder: Path, workplace: Path | None) -> None:
+    """Draw the pictures for which there are enough runs."""
+    del workplace
+    result, settings, baselines = _read(folder)
+    runs = result["runs"]
+    if not runs:
+        return
+    if len(comparable_groups(runs, TOP)) > 1:
+        save_figure(draw_chart(runs, baselines, settings), folder / "chart.png")
+        save_figure(draw_costs(runs), folder / "costs.png")
+    if groups := [group for group in _groups(runs) if group not in TOP and len(comparable_groups(runs, [group])) > 1]:
+        save_figure(draw_parts(runs, groups, settings), folder / "parts.png")
+    save_figure(draw_scenes(runs, baselines, settings), folder / "scenes.png")
 
-    Args:
-        result: with `runs`, `front`, `external`, `settings` and `machine`.
-        pictures: PNG files, which it carries inside.
-    """
-    head, rows = rows_of(result["runs"])
-    tables = [grid(head, [[escape(f) for f in row] for row in rows[group]], GROUPS[group]) for group in rows]
-    front = [
-        [f"{row['seconds']}", escape(VARIANTS[row["best"]].label), f"{row['psnr']:.2f}", _behind(row)]
-        for row in result["front"]
+
+def describe(folder: Path) -> str:
+    """The README.md."""
+    result, settings, baselines = _read(folder)
+    runs = result["runs"]
+    parts = ["# Speed against accuracy: test PSNR against training time", _describe_settings(runs, settings)]
+    if runs:
+        parts += [*_picture(folder, "chart"), *_describe_methods(runs, baselines), *_picture(folder, "costs")]
+        for group in _groups(runs):
+            title, text = GROUPS[group]
+            parts += [f"## {title}", text, _group_table(runs, group), *_ahead_and_behind(runs, group)]
+        parts += _picture(folder, "parts")
+        parts += [*_describe_comparisons(runs), *_describe_envelope(runs)]
+        parts += [*_describe_scenes(runs, baselines), *_picture(folder, "scenes"), *_describe_baselines(runs, baselines)]
+    if (folder / NOTES).exists():
+        parts += ["## Remarks", (folder / NOTES).read_text(encoding="utf-8").strip()]
+    parts += [
+        "## Reproduce it",
+        f"```bash\n{chr(10).join(_commands(folder, runs, settings, baselines))}\n```",
+        "`edge-se bench report` writes this page and its pictures again from the numbers alone.",
+        f"Measured on: {describe_machine(result['machine'])}.",
     ]
-    others = [[escape(field) for field in row] for row in rows_of_others(result["runs"], result["external"])]
-    top = ("", "version", "flags", *head[1 : head.index("failed")])
-    parts = [
-        f"<h1>{TITLE}</h1>",
-        f"<p>{len(result['runs'])} trainings, images of {result['settings']['pixels']} pixels a side. Time runs from "
-        "reading the data to the end of a step; looking at test views is left out. Every plan is as long as the "
-        "chart.</p>",
-        *(figure(path, CAPTIONS[path.stem]) for path in pictures),
-        "<h2>The front</h2>",
-        grid(("seconds", "best", "dB", f"{VARIANTS[RECOMMENDED].label} behind it"), front),
-        "<h2>Every variant</h2>",
-        *tables,
-        *(("<h2>Other programs</h2>", grid(top, others)) if others else ()),
-        "<h2>Settings</h2>",
-        f'<p class="dim">{escape(json.dumps(result["settings"]))} {escape(json.dumps(result["machine"]))}</p>',
+    return "\n\n".join(parts) + "\n"
+
+
+def tables(folder: Path) -> dict[str, str]:
+    """methods: PSNR of methods and baselines after some seconds and at the end, and failures."""
+    result, _, baselines = _read(folder)
+    runs = result["runs"]
+    shown = comparable_groups(runs, TOP)
+    seconds = _shown_seconds(runs)
+    rows = [
+        [VARIANTS[name].label, *_psnr_fields(shown[name], seconds), _failures(shown[name])]
+        for name in shown
+        if VARIANTS[name].group == "methods"
     ]
-    return page(TITLE, parts)
+    rows += [[name, *fields, "–"] for name, fields in _baseline_rows(runs, baselines)]
+    return {"methods": markdown_table(["", *_seconds_head(seconds), "failed"], rows)}
 
 
-def _behind(row: dict[str, Any]) -> str:
-    behind = row["recommended_behind"]
-    return "–" if behind is None else f"{behind:.2f} dB"
+def _read(folder: Path) -> tuple[dict[str, Any], ChartSettings, list[dict[str, Any]]]:
+    result = read_result(folder / "result.json")
+    settings = ChartSettings(**result["settings"])
+    return result, settings, read_baselines(folder, settings)
+
+
+def _picture(folder: Path, name: str) -> list[str]:
+    return [f"![{CAPTIONS[name]}]({name}.png)"] if (folder / f"{name}.png").exists() else []
+
+
+def _groups(runs: list[Run]) -> list[Group]:
+    """Groups that have runs; the recommended variant belongs to all of them."""
+    return [group for group in GROUPS if any(VARIANTS[run["variant"]].group == group for run in runs)]
+
+
+def _describe_settings(runs: list[Run], settings: ChartSettings) -> str:
+    time = "CPU seconds on one core" if settings.threads == 1 else f"seconds on {settings.threads} cores"
+    return (
+        f"How good is a NeRF after how many seconds of training? {len(runs)} trainings of {settings.seconds:g} {time}, "
+        f"on images of {settings.image_size} pixels a side. Training time runs from reading the data, the analysis of "
+        "the scene included, to the end of a step; imports and evaluations are left out. Every training is planned "
+        "(learning rate, phases) for the time that it has.\n\n"
+        "Numbers are PSNR of the test views in dB: the mean over scenes of the median over seeds. Every table compares "
+        "on the scenes and seeds that all of its rows have. *Failed*: nothing of the object was learnt (its error is "
+        f"above {COLLAPSED_SHARE:.0%} of that of a plain background), or the PSNR is less than {MIN_GAIN:g} dB above a "
+        "plain background's. *Queries*: points at which a network is evaluated. *Memory*: the peak above what imports "
+        "take."
+    )
+
+
+def _describe_methods(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[str]:
+    """Who is best of the methods, and who failed."""
+    shown = comparable_groups(runs, ["methods"])
+    if len(shown) < 2 or RECOMMENDED not in shown:
+        return []
+    ends = {VARIANTS[name].label: mean_psnr_at(shown[name], END) or 0.0 for name in shown if name != RECOMMENDED}
+    best = max(ends, key=ends.__getitem__)
+    scenes = ", ".join(scenes_of(shown[RECOMMENDED]))
+    label = VARIANTS[RECOMMENDED].label
+    end = mean_psnr_at(shown[RECOMMENDED], END) or 0.0
+    text = f"On {scenes} {label} ends at {end:.2f} dB, the best of the other methods ({best}) at {ends[best]:.2f} dB"
+    others = [(fields[-1], name) for name, fields in _baseline_rows(runs, baselines) if fields[-1] != "–"]
+    if others:
+        psnr, name = max(others, key=lambda row: float(row[0]))
+        text += f", the best of the other programs ({name}) at {psnr} dB"
+    found = {name: runs_of(runs, name) for name in shown}
+    failures = [f"{VARIANTS[name].label} in {_failures(found[name])}" for name in found if any(map(failed, found[name]))]
+    verdict = f"Trainings failed with {', '.join(failures)}; with no other method." if failures else "None failed."
+    return [f"{text} (scenes and seeds that all have). {verdict}"]
+
+
+def _group_table(runs: list[Run], group: Group) -> str:
+    """A group's variants: PSNR, failures and costs."""
+    shown = comparable_groups(runs, TOP if group in TOP else [group])
+    seconds = _shown_seconds(runs)
+    rows = [
+        [VARIANTS[name].label, *_psnr_fields(shown[name], seconds), _failures(shown[name]), *_cost_fields(shown[name])]
+        for name in shown
+        if VARIANTS[name].group == group or name == RECOMMENDED
+    ]
+    return markdown_table(
+        ["", *_seconds_head(seconds), "failed", "ms a step", "queries a step", "memory"], rows
+    )
+
+
+def _ahead_and_behind(runs: list[Run], group: Group) -> list[str]:
+    """Which variants of a group are ahead of the recommended one at first, and which in the end."""
+    seconds = _shown_seconds(runs)
+    shown = comparable_groups(runs, [group])
+    if group in TOP or RECOMMENDED not in shown or not seconds:
+        return []
+    signs: dict[tuple[bool, bool], list[str]] = {}
+    for name in (name for name in shown if name != RECOMMENDED):
+        first, end = (
+            (mean_psnr_at(shown[name], t) or 0.0) > (mean_psnr_at(shown[RECOMMENDED], t) or 0.0)
+            for t in (seconds[0], END)
+        )
+        signs.setdefault((first, end), []).append(VARIANTS[name].label)
+    words = {
+        (True, True): "ahead both times",
+        (True, False): "ahead at first, behind in the end",
+        (False, True): "behind at first, ahead in the end",
+        (False, False): "behind both times",
+    }
+    listed = "; ".join(f"{words[key]}: {', '.join(signs[key])}" for key in words if key in signs)
+    return [f"Against {VARIANTS[RECOMMENDED].label}, after {seconds[0]} s and at the end: {listed}."]
+
+
+def _describe_comparisons(runs: list[Run]) -> list[str]:
+    """The pairs of variants that tell what one thing is worth, over all scenes that both were trained on."""
+    seconds = [*_shown_seconds(runs), END]
+    rows = []
+    for (first, second), what in COMPARISONS.items():
+        ahead = [differences(runs, first, second, t) for t in seconds]
+        if ahead[-1]:
+            trained = len(comparable(runs, (first, second))[first])
+            pair = f"{VARIANTS[first].full_label} − {VARIANTS[second].full_label}"
+            rows.append([what, pair, f"{len(ahead[-1])}", f"{trained}", *map(_difference, ahead)])
+    if not rows:
+        return []
+    head = ["what", "difference", "scenes", "pairs of trainings", *_seconds_head(seconds[:-1])]
+    return [
+        "## What one thing is worth",
+        "Differences in dB between two variants on all scenes that both were trained on: the mean, and in brackets the "
+        "least and the greatest of a scene.",
+        markdown_table(head, rows),
+    ]
+
+
+def _difference(ahead: Mapping[str, float]) -> str:
+    if not ahead:
+        return "–"
+    mean = f"{statistics.mean(ahead.values()):+.2f}"
+    return mean if len(ahead) == 1 else f"{mean} [{min(ahead.values()):+.2f}, {max(ahead.values()):+.2f}]"
+
+
+def _describe_envelope(runs: list[Run]) -> list[str]:
+    """Which variant is best when."""
+    if len(comparable_groups(runs)) < 2:
+        return []
+    label = VARIANTS[RECOMMENDED].label
+    better = [VARIANTS[name].full_label for name in always_better(runs)]
+    rows = [
+        [f"{seconds} s", VARIANTS[name].full_label, decimals(psnr), decimals(gap)]
+        for seconds, name, psnr, gap in upper_envelope(runs)
+    ]
+    return [
+        "## Which variant is best when",
+        f"The upper envelope of all variants. Ahead of {label} at every evaluation: {', '.join(better) or 'none'}.",
+        markdown_table(["after", "best", "PSNR", f"{label} below it"], rows),
+    ]
+
+
+def _describe_scenes(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[str]:
+    """PSNR at the end on each scene, of variants and baselines that were trained on all of them."""
+    scenes = scenes_of(runs)
+    by_name = {v.full_label: runs_of(runs, name) for name, v in VARIANTS.items()}
+    by_name |= {name_of(baseline): baseline["runs"] for baseline in baselines}
+    complete = {name: found for name, found in by_name.items() if set(scenes_of(found)) >= set(scenes)}
+    if len(scenes) < 2 or not complete:
+        return []
+    common = set.intersection(*({(r["scene"], r["seed"]) for r in found} for found in complete.values()))
+    rows = []
+    for name, found in complete.items():
+        ends = {s: [r for r in found if r["scene"] == s and (s, r["seed"]) in common] for s in scenes}
+        psnr = [statistics.median(run["curve"][-1][-1] for run in ends[scene]) for scene in scenes]
+        marks = [any("outcome" in run and failed(run) for run in ends[scene]) for scene in scenes]
+        cells = [f"({value:.2f})" if mark else f"{value:.2f}" for value, mark in zip(psnr, marks, strict=True)]
+        least = min(run["curve"][-1][-1] for of_scene in ends.values() for run in of_scene)
+        rows.append([name, *cells, f"{statistics.mean(psnr):.2f}", f"{least:.2f}", _failures(sum(ends.values(), []))])
+    seeds = sorted({seed for _, seed in common})
+    return [
+        "## Every scene",
+        f"PSNR at the end, median over seeds ({_listed(seeds)}); in brackets where a training failed. *Least*: of a "
+        "single training.",
+        markdown_table(["", *scenes, "mean", "least", "failed"], rows),
+    ]
+
+
+def _describe_baselines(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[str]:
+    if not baselines:
+        return []
+    seconds = _shown_seconds(runs)
+    rows = [[name, *fields] for name, fields in _baseline_rows(runs, baselines)]
+    flags = [f"- {name_of(b)}: version {b['settings']['program_version']}, `{b['settings']['flags']}`" for b in baselines]
+    return [
+        "## Other programs (baselines)",
+        "They run unchanged, by the same clock, on the same data and test views, with smaller settings than their "
+        "own, because no CPU gets anywhere with those; others may find better flags. Whether they failed is not known.",
+        markdown_table(["", *_seconds_head(seconds)], rows),
+        "\n".join(flags),
+    ]
+
+
+def _baseline_rows(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
+    """Name, and PSNR on the scenes that the methods are compared on."""
+    shown = [run for found in comparable_groups(runs, TOP).values() for run in found]
+    seconds = _shown_seconds(runs)
+    return [(name_of(baseline), _psnr_fields(baseline_runs(baseline, shown), seconds)) for baseline in baselines]
+
+
+def _shown_seconds(runs: list[Run]) -> list[int]:
+    """Moments that tables have columns for."""
+    return [seconds for seconds in (3, 7, 20, 60) if any(run["seconds"] > 1.05 * seconds for run in runs)]
+
+
+def _seconds_head(seconds: Iterable[int | float]) -> list[str]:
+    return [*(f"{t:g} s" for t in seconds), "end"]
+
+
+def _psnr_fields(runs: list[Run], seconds: Sequence[float]) -> list[str]:
+    return [decimals(mean_psnr_at(runs, t)) for t in (*seconds, END)]
+
+
+def _failures(runs: list[Run]) -> str:
+    return f"{sum(map(failed, runs))} of {len(runs)}" if all("outcome" in run for run in runs) else "–"
+
+
+def _cost_fields(runs: list[Run]) -> list[str]:
+    step = statistics.median(1000 * (run["seconds"] - run["ready_seconds"]) / run["steps"] for run in runs)
+    queries = statistics.median(run["queries"] / run["steps"] for run in runs)
+    memory = statistics.median(run["peak_bytes"] for run in runs) / MIB
+    return [f"{step:.1f}", f"{queries:,.0f}", f"{memory:,.0f} MiB"]
+
+
+def _listed(values: Iterable[Any]) -> str:
+    return ", ".join(map(str, values))
+
+
+def _commands(
+    folder: Path, runs: list[Run], settings: ChartSettings, baselines: Sequence[dict[str, Any]]
+) -> list[str]:
+    """Commands that train exactly the runs that there are, baselines first."""
+    output = ["--output-dir", f"configs/{folder.name}"]
+    shared = []
+    if settings.seconds != ChartSettings.seconds:
+        shared += ["--seconds", f"{settings.seconds:g}"]
+    if settings.threads != ChartSettings.threads:
+        shared += ["--threads", f"{settings.threads}"]
+    if settings.image_size != ChartSettings.image_size:
+        shared += ["--data", "DIR"]
+    commands = []
+    for baseline in baselines:
+        of = baseline["settings"]
+        words = ["baselines", *output, "--program", of["program"], "--label", of["label"]]
+        words += ["--checkout", of["program"]] if not of["program"].startswith("nerfstudio-") else []
+        for _, scenes, seeds in _blocks([{**run, "variant": of["program"]} for run in baseline["runs"]]):
+            commands.append([*words, *_scene_flags(scenes, seeds), *shared, f"--flags={of['flags']}"])
+    for variants, scenes, seeds in _blocks(runs):
+        chosen = [] if set(variants) == set(VARIANTS) else ["--variants", *variants]
+        commands.append(["chart", *output, *chosen, *_scene_flags(scenes, seeds), *shared])
+    return [shlex.join(["edge-se", "bench", *words]) for words in commands]
+
+
+def _blocks(runs: list[Run]) -> list[tuple[list[str], list[str], list[int]]]:
+    """Runs as blocks of variants x scenes x seeds that share none."""
+    scenes_by_seeds: dict[str, dict[tuple[int, ...], list[str]]] = {}
+    for name in dict.fromkeys([*VARIANTS, *(run["variant"] for run in runs)]):
+        found = runs_of(runs, name)
+        for scene in scenes_of(found):
+            seeds = tuple(sorted(run["seed"] for run in found if run["scene"] == scene))
+            scenes_by_seeds.setdefault(name, {}).setdefault(seeds, []).append(scene)
+    blocks: dict[tuple[tuple[str, ...], tuple[int, ...]], list[str]] = {}
+    for name, by_seeds in scenes_by_seeds.items():
+        for seeds, scenes in by_seeds.items():
+            blocks.setdefault((tuple(scenes), seeds), []).append(name)
+    return [(variants, list(scenes), list(seeds)) for (scenes, seeds), variants in blocks.items()]
+
+
+def _scene_flags(scenes: Sequence[str], seeds: Sequence[int]) -> list[str]:
+    flags = [] if list(scenes) == ["bricks"] else ["--scenes", *scenes]
+    return flags if list(seeds) == [0, 1, 2] else [*flags, "--seeds", *map(str, seeds)]

@@ -1,7 +1,7 @@
-"""What the chart's runs say: PSNR against training time, the front, and what each part is worth.
+"""What the chart's runs say: PSNR after seconds of training, and which variant is best when.
 
-A variant's curve is, at every look, the mean over scenes of the median over seeds; a run that has ended stays at what
-it ended with. The front is, at every moment, the variant that is best then.
+A variant's PSNR at a moment is the mean over scenes of the median over seeds; a run that has ended stays at what it
+ended with. Variants are only compared on the scenes and seeds that all of them have.
 """
 
 from __future__ import annotations
@@ -12,169 +12,97 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.chart.train import LOOKS
-from edge_se_sampler.bench.chart.variants import GROUPS, VARIANTS, Group
+from edge_se_sampler.bench.chart.trials import EVAL_SECONDS
+from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, VARIANTS, Group
+from edge_se_sampler.bench.runner import Run
 
-Run = dict[str, Any]
-RECOMMENDED = "lean"
-TOP: tuple[Group, ...] = ("methods", "scorings")
-"""Kinds of variants on the chart itself; the others are parts of the recommended method."""
+END = float("inf")
+"""The moment at which every training has ended."""
 
 
 def scenes_of(runs: list[Run]) -> list[str]:
-    """Scenes, in the order of their names."""
+    """Scenes, in alphabetical order."""
     return sorted({run["scene"] for run in runs})
 
 
-def at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
-    """PSNR at a moment of training, between looks by the logarithm of time; None before the first look,
-    which comes a step late."""
-    times, psnr = [point[0] for point in curve], [point[-1] for point in curve]
+def runs_of(runs: list[Run], variant: str, scene: str | None = None) -> list[Run]:
+    """The runs of a variant, and of a scene."""
+    return [run for run in runs if run["variant"] == variant and scene in (None, run["scene"])]
+
+
+def psnr_at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
+    """PSNR at a moment of training, between evaluations linear in the logarithm of time; None before the first
+    evaluation, which may come a step late.
+
+    Args:
+        curve: rows that begin with seconds and end with PSNR.
+    """
+    times, psnr = [row[0] for row in curve], [row[-1] for row in curve]
     if not times or seconds < times[0] * 0.99:
         return None
     return float(np.interp(np.log(seconds), np.log(times), psnr))
 
 
-def over_scenes(runs: list[Run], seconds: float, of_seeds: Callable[[Any], Any] = np.median) -> float | None:
-    """Mean over scenes of the median (or what else) over seeds; None if a run had nothing to show yet."""
-    values = {scene: [at(r["curve"], seconds) for r in runs if r["scene"] == scene] for scene in scenes_of(runs)}
-    if not values or any(value is None for found in values.values() for value in found):
+def mean_psnr_at(runs: list[Run], seconds: float, over_seeds: Callable[[Any], Any] = np.median) -> float | None:
+    """Mean over scenes of the median (or another statistic) over seeds; None if a run has not been evaluated yet."""
+    values = {scene: [psnr_at(r["curve"], seconds) for r in runs if r["scene"] == scene] for scene in scenes_of(runs)}
+    if not values or any(value is None for of_seeds in values.values() for value in of_seeds):
         return None
-    return statistics.mean(float(of_seeds(found)) for found in values.values())
+    return statistics.mean(float(over_seeds(of_seeds)) for of_seeds in values.values())
 
 
-def comparable(runs: list[Run], groups: Collection[Group] = tuple(GROUPS)) -> dict[str, list[Run]]:
-    """Variants of some groups, and the recommended one, -> their runs on the scenes and seeds that all of them have."""
-    names = [name for name, variant in VARIANTS.items() if variant.group in groups or name == RECOMMENDED]
-    by_variant = {name: mine for name in names if (mine := [run for run in runs if run["variant"] == name])}
-    if not by_variant:
-        return {}
-    common = set.intersection(*({(run["scene"], run["seed"]) for run in mine} for mine in by_variant.values()))
+def comparable(runs: list[Run], variants: Collection[str]) -> dict[str, list[Run]]:
+    """Those of some variants that have runs -> their runs on the scenes and seeds that all of them have; empty if there
+    are none."""
+    by_variant = {name: found for name in VARIANTS if name in variants and (found := runs_of(runs, name))}
+    keys = [{(run["scene"], run["seed"]) for run in found} for found in by_variant.values()]
+    common = set.intersection(*keys) if keys else set()
     if not common:
         return {}
-    return {name: [run for run in mine if (run["scene"], run["seed"]) in common] for name, mine in by_variant.items()}
+    return {name: [r for r in found if (r["scene"], r["seed"]) in common] for name, found in by_variant.items()}
 
 
-def front(runs: list[Run]) -> list[dict[str, Any]]:
-    """At every look the best variant, and how far the recommended one is from it, dB."""
-    told = []
-    for seconds in (look for look in LOOKS if any(run["seconds"] >= look for run in runs)):
-        known = {name: over_scenes(mine, seconds) for name, mine in comparable(runs).items()}
-        values = {name: value for name, value in known.items() if value is not None}
-        if values:
-            best = max(values, key=lambda name, of=values: of[name])
-            mine = values.get(RECOMMENDED)
-            behind = None if mine is None else round(values[best] - mine, 3)
-            told.append(
-                {"seconds": seconds, "best": best, "psnr": round(values[best], 3), "recommended_behind": behind}
-            )
-    return told
+def comparable_groups(runs: list[Run], groups: Collection[Group] = tuple(GROUPS)) -> dict[str, list[Run]]:
+    """`comparable` of the variants of some groups, and the recommended one."""
+    return comparable(runs, [name for name, v in VARIANTS.items() if v.group in groups or name == RECOMMENDED])
 
 
-def dominating(runs: list[Run]) -> list[str]:
-    """Variants better than the recommended one at every look that both have: with one, it is off the front."""
-    told = []
-    for name in {run["variant"] for run in runs} - {RECOMMENDED}:
-        both = comparable([run for run in runs if run["variant"] in (name, RECOMMENDED)])
-        pairs = [(over_scenes(both[RECOMMENDED], look), over_scenes(both[name], look)) for look in LOOKS]
-        known = [(ours, theirs) for ours, theirs in pairs if ours is not None and theirs is not None]
-        if known and all(theirs > ours for ours, theirs in known):
-            told.append(name)
-    return sorted(told)
+def upper_envelope(runs: list[Run]) -> list[tuple[int, str, float, float | None]]:
+    """At every evaluation: seconds, the best variant, its PSNR, and how far the recommended one lies below, dB."""
+    by_variant = comparable_groups(runs)
+    rows = []
+    for seconds in (s for s in EVAL_SECONDS if any(run["seconds"] >= s for run in runs)):
+        psnr = {name: value for name in by_variant if (value := mean_psnr_at(by_variant[name], seconds)) is not None}
+        if psnr:
+            best = max(psnr, key=psnr.__getitem__)
+            gap = psnr[best] - psnr[RECOMMENDED] if RECOMMENDED in psnr else None
+            rows.append((seconds, best, psnr[best], gap))
+    return rows
 
 
-def rows_of(runs: list[Run]) -> tuple[list[str], dict[Group, list[list[str]]]]:
-    """The table's head, and of every group its variants' rows: PSNR at looks and at the end, failures, costs."""
-    looks = _shown_looks(runs)
-    head = ["", *(f"{look} s" for look in looks), "end", "failed", "ms a step", "evaluations a step", "memory"]
-    told: dict[Group, list[list[str]]] = {}
-    for group in GROUPS:
-        mine = comparable(runs, TOP if group in TOP else (group,))
-        if any(VARIANTS[name].group == group for name in mine):
-            shown = [name for name in mine if VARIANTS[name].group == group or name == RECOMMENDED]
-            told[group] = [[VARIANTS[name].label, *_fields(mine[name], looks)] for name in shown]
-    return head, told
+def differences(runs: list[Run], first: str, second: str, seconds: float) -> dict[str, float]:
+    """Scene -> by how many dB the first variant is ahead of the second at a moment, medians over their common seeds."""
+    by_variant = comparable(runs, (first, second))
+    if len(by_variant) < 2:
+        return {}
+    ahead = {}
+    for scene in scenes_of(by_variant[first]):
+        values = [mean_psnr_at(runs_of(by_variant[name], name, scene), seconds) for name in (first, second)]
+        if None not in values:
+            ahead[scene] = values[0] - values[1]
+    return ahead
 
 
-def rows_of_scenes(runs: list[Run], external: Sequence[dict[str, Any]] = ()) -> tuple[list[str], list[list[str]]]:
-    """Of methods and scorings, and other programs, that were trained on all scenes with one seed, the least: PSNR at
-    the end on each, in brackets where nothing was learnt, as far as that is known. No rows where there is one scene."""
-    scenes, seed = scenes_of(runs), min(run["seed"] for run in runs)
-    ends = {(run["variant"], run["scene"]): run for run in runs if run["seed"] == seed}
-    top = [name for name, variant in VARIANTS.items() if variant.group in TOP]
-    names = [name for name in top if all((name, scene) in ends for scene in scenes)]
-    told = [[VARIANTS[name].label, *(_end(ends[name, scene]) for scene in scenes)] for name in names]
-    for program in external:
-        theirs = {run["scene"]: run["curve"][-1][1] for run in program["runs"] if run["seed"] == seed}
-        if theirs.keys() >= set(scenes):
-            told.append([program["name"], *(_shown(theirs[scene]) for scene in scenes)])
-    return ["", *scenes], told if len(scenes) > 1 else []
+def always_better(runs: list[Run]) -> list[str]:
+    """Variants ahead of the recommended one, in the mean over scenes, at every evaluation that both have."""
+    names = [name for name in VARIANTS if name != RECOMMENDED and runs_of(runs, name)]
+    ahead = {name: [differences(runs, name, RECOMMENDED, seconds) for seconds in EVAL_SECONDS] for name in names}
+    known = {name: [statistics.mean(d.values()) for d in rows if d] for name, rows in ahead.items()}
+    return [name for name, values in known.items() if values and min(values) > 0]
 
 
-def beside(program: dict[str, Any], shown: dict[str, list[Run]]) -> list[Run]:
-    """Another program's runs on the scenes of what is shown; none, where it lacks one of them."""
-    scenes = {run["scene"] for mine in shown.values() for run in mine}
-    mine = [run for run in program["runs"] if run["scene"] in scenes]
-    return mine if scenes == {run["scene"] for run in mine} else []
-
-
-def rows_of_others(runs: list[Run], external: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """Of every other program its name, version, flags, and PSNR at the same looks and at the end."""
-    shown = comparable(runs, TOP)
-    told = []
-    for program in external:
-        mine = beside(program, shown)
-        values = [over_scenes(mine, look) for look in (*_shown_looks(runs), float("inf"))]
-        told.append([*(str(program[key]) for key in ("name", "version", "command")), *map(_shown, values)])
-    return told
-
-
-def table(runs: list[Run], external: Sequence[dict[str, Any]]) -> str:
-    """Markdown of both."""
-    head, rows = rows_of(runs)
-    tables = {GROUPS[group]: (head, mine) for group, mine in rows.items()}
-    scenes, ends = rows_of_scenes(runs, external)
-    if ends:
-        tables["Every scene, one seed, at the end"] = (scenes, ends)
-    if external:
-        looks = head[1 : head.index("failed")]
-        tables["Other programs"] = (["", "version", "flags", *looks], rows_of_others(runs, external))
-    parts = [
-        "Mean over scenes of test PSNR in dB, medians over seeds, by seconds of training; in each table the scenes and "
-        "seeds that all of its variants have."
-    ]
-    for title, (top, mine) in tables.items():
-        lines = [f"| {' | '.join(row)} |" for row in (top, *mine)]
-        lines.insert(1, "|---" * len(top) + "|")
-        parts.append(f"**{title}**\n\n" + "\n".join(lines))
-    return "\n\n".join(parts) + "\n"
-
-
-def _shown_looks(runs: list[Run]) -> list[int]:
-    return [look for look in (3, 7, 20, 60) if any(run["seconds"] > 1.05 * look for run in runs)]
-
-
-def _end(run: Run) -> str:
-    return f"{run['psnr']:.2f}" if run["outcome"] == "learnt" else f"({run['psnr']:.2f})"
-
-
-def _shown(psnr: float | None) -> str:
-    return "–" if psnr is None else f"{psnr:.2f}"
-
-
-def _fields(runs: list[Run], looks: list[int]) -> list[str]:
-    values = [over_scenes(runs, look) for look in looks]
-    end = statistics.mean(
-        statistics.median(run["psnr"] for run in runs if run["scene"] == scene) for scene in scenes_of(runs)
-    )
-    failed = sum(run["outcome"] != "learnt" for run in runs)
-    step = statistics.median(1000 * (run["seconds"] - run["ready_seconds"]) / run["steps"] for run in runs)
-    asked = statistics.median(run["evaluations"] / run["steps"] for run in runs)
-    memory = statistics.median(run["peak_bytes"] for run in runs) / 2**20
-    return [
-        *map(_shown, (*values, end)),
-        f"{failed} of {len(runs)}",
-        f"{step:.1f}",
-        f"{asked:,.0f}",
-        f"{memory:,.0f} MiB",
-    ]
+def baseline_runs(baseline: dict[str, Any], runs: list[Run]) -> list[Run]:
+    """Another program's runs on the scenes of some runs; none if it lacks one of them."""
+    scenes = set(scenes_of(runs))
+    found = [run for run in baseline["runs"] if run["scene"] in scenes]
+    return found if scenes == set(scenes_of(found)) else []

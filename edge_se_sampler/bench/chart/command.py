@@ -1,0 +1,100 @@
+"""edge-se bench chart. Torch-free until it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edge_se_sampler.bench.chart.variants import VARIANTS
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.errors import InputError, check_known
+
+if TYPE_CHECKING:
+    from edge_se_sampler.bench.chart.trials import ChartSettings
+    from edge_se_sampler.bench.runner import Experiment
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChartOptions:
+    """What the chart and its baselines are trained on, and how long."""
+
+    workplace: Path = Path("bench")
+    """Where synthetic scenes are kept."""
+    data: Path | None = None
+    """Folder with a Blender folder a scene, all of one image size; left out, seven synthetic scenes of 100 x 100."""
+    scenes: tuple[str, ...] = ("bricks",)
+    """Of the seven, or of --data."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of weights, pixels and jitter."""
+    seconds: float = 60
+    """Of training, and of the plan, of each."""
+    threads: int = 1
+    """Of a training. One: timed in CPU seconds; more: in wall-clock time, so leave the machine alone."""
+
+    def settings(self) -> ChartSettings:
+        """The checked options.
+
+        Raises:
+            InputError: a value has no meaning, or the scenes' images differ in size.
+        """
+        from edge_se_sampler.bench.chart.trials import ChartSettings
+
+        if not (self.seeds and self.scenes):
+            raise InputError("--seeds and --scenes: give at least one of each")
+        if not 1 <= self.seconds < float("inf"):
+            raise InputError(f"--seconds is {self.seconds}: must be at least 1")
+        if self.threads < 1:
+            raise InputError(f"--threads is {self.threads}: must be at least 1")
+        return ChartSettings(self.seconds, self.threads, self._image_size())
+
+    def _image_size(self) -> int:
+        """Longer side of the scenes' images."""
+        from edge_se_sampler.bench.chart.trials import ChartSettings
+        from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
+
+        if self.data is None:
+            check_known("scenes", self.scenes, ANALOG_OF)
+            return ChartSettings.image_size
+        sizes = {scene: max(read_blender(self.data / scene, "train").images[0].shape[:2]) for scene in self.scenes}
+        if len(set(sizes.values())) > 1:
+            listed = ", ".join(f"{scene} {size}" for scene, size in sizes.items())
+            raise InputError(f"--data {self.data}: scenes of different sizes ({listed} pixels): chart them separately")
+        return next(iter(sizes.values()))
+
+    def scene_folder(self, scene: str) -> Path:
+        """A scene's Blender folder; a synthetic one is rendered if it is missing."""
+        from edge_se_sampler.bench.scenes import cached_scene
+
+        return cached_scene(self.workplace, scene) if self.data is None else self.data / scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchChart(ChartOptions, ExperimentCommand):
+    """Chart test PSNR against training seconds: methods, lean-nerf with one thing changed at a time, and the baselines
+    in the folder. Goes on where it was stopped.
+
+    Every training has a process of its own, because its memory is measured: start dask workers with --no-nanny."""
+
+    variants: tuple[str, ...] = ()
+    """Which; none: all. --dry-run lists their names."""
+
+    def experiment(self) -> Experiment:
+        from edge_se_sampler.bench.baselines.results import read_baselines
+        from edge_se_sampler.bench.chart.trials import run_trial, trials
+        from edge_se_sampler.bench.runner import Experiment
+
+        check_known("variants", self.variants, VARIANTS)
+        settings = self.settings()
+        read_baselines(self.output_dir, settings)  # refuses, before anything is trained, those that cannot be compared
+        return Experiment(
+            "chart",
+            settings,
+            lambda runs: trials(self.variants, self.scenes, self.seeds),
+            run_trial,
+            lambda trial: (settings, self.scene_folder(trial.scene)),
+        )
+
+    def default_workers(self) -> int:
+        return max(1, super().default_workers() // self.threads)

@@ -1,0 +1,186 @@
+"""One training of the chart: test PSNR after seconds of training, under a plan that fills the time that it has.
+
+Training time runs from reading the data (scene analysis and tables included) to the end of a step; imports and
+evaluations are left out. Trainings on one thread are timed in CPU seconds, which other work on the machine changes little.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from edge_se_sampler.bench.chart.variants import VARIANTS
+from edge_se_sampler.bench.machine import resident_memory
+from edge_se_sampler.bench.outcomes import measure_outcome
+from edge_se_sampler.bench.overrides import override
+from edge_se_sampler.bench.runner import Run, run_in_subprocess
+from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
+from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_color, render_rays
+from edge_se_sampler.engine.metrics import composite_on, psnr
+from edge_se_sampler.engine.session import prepare, test_pictures
+from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.models.ray_model import RayModel
+
+EVAL_SECONDS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)
+"""Seconds of training after which the test views are evaluated."""
+PIXEL_STRIDE = 3
+"""On the way, PSNR is of every third pixel of each test view; at the end, of all."""
+PROBE_STEPS = 12
+"""Steps from the end of the plan, the slower ones, whose time tells how many will fit; the first quarter is warm-up."""
+PROBE_FRACTION = 1 / 30
+"""Fraction of the time that is trained before them, because cells may be subdivided, which makes steps slower."""
+MAX_PLAN_ERROR = 0.1
+"""A plan that misses its time by more than this fraction is repeated once, by how long its steps took."""
+
+
+@dataclass(frozen=True)
+class ChartSettings:
+    """How long is trained, and on what."""
+
+    seconds: float = 60
+    """Of training; the plan, which learning rate and phases follow, is as long."""
+    threads: int = 1
+    """Of a training. One: CPU seconds; more: seconds of wall-clock time."""
+    image_size: int = 100
+    """Longer side of the images, pixels."""
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        """Seconds."""
+        return time.process_time if self.threads == 1 else time.perf_counter
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What identifies a training."""
+
+    variant: str
+    scene: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """A name for its folder."""
+        return f"{self.variant}-{self.scene}-{self.seed}"
+
+
+def trials(variants: Sequence[str], scenes: Sequence[str], seeds: Sequence[int]) -> list[Trial]:
+    """Seed by seed and scene by scene, so that what is compared is trained side by side; no variants: all."""
+    return [Trial(name, scene, seed) for seed, scene, name in product(seeds, scenes, variants or VARIANTS)]
+
+
+def config_of(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
+    """What a trial trains; its number of iterations is still open."""
+    variant = VARIANTS[trial.variant]
+    config: TrainerConfig = override(registered_methods()[variant.method].specification.config, variant.changes)
+    machine = MachineConfig(seed=trial.seed, device_type="cpu")  # seconds are a CPU's
+    return replace(config, data=data, output_dir=output_dir, experiment_name=trial.name, machine=machine)
+
+
+def run_trial(trial: Trial, settings: ChartSettings, data: Path) -> Run:
+    """`train_and_evaluate` in a fresh process: a process has a single peak of memory."""
+    return run_in_subprocess(train_and_evaluate, trial, settings, data)
+
+
+def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run:
+    """Train, and evaluate on the way.
+
+    Returns:
+        psnr and outcome at the end; seconds, of them ready_seconds before the first step; steps, and the planned ones;
+        queries: points at which networks were evaluated in training; peak_bytes of memory, evaluations included, above
+        what imports take; and curve: [seconds, steps, queries, mean test PSNR] at every evaluation.
+    """
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
+        torch.set_num_threads(settings.threads)
+        memory_before = resident_memory()
+        config = config_of(trial, data, Path(folder))
+        run = _train_iterations(config, iterations_within(config, settings), settings)
+        ready = run["ready_seconds"]
+        fitting = max(1, round(run["steps"] * (settings.seconds - ready) / (run["seconds"] - ready)))
+        if abs(1 - run["planned_steps"] / fitting) > MAX_PLAN_ERROR:
+            run = _train_iterations(config, fitting, settings)
+        return {**run, "peak_bytes": max(0, resident_memory("VmHWM") - memory_before)}
+
+
+def iterations_within(config: TrainerConfig, settings: ChartSettings) -> int:
+    """How many iterations fit into the training time: after reading the data, with steps as they are late in the plan."""
+    with tempfile.TemporaryDirectory() as folder:
+        planned = 10_000
+        start = settings.clock()
+        trainer = prepare(replace(config, max_num_iterations=planned, output_dir=Path(folder)))
+        ready = settings.clock() - start
+        for step in range(planned - PROBE_STEPS):
+            if settings.clock() - start > ready + PROBE_FRACTION * settings.seconds:
+                break
+            trainer.train_iteration(step)
+        times = []
+        for step in range(planned - PROBE_STEPS, planned):
+            start = settings.clock()
+            trainer.train_iteration(step)
+            times.append(settings.clock() - start)
+    return max(PROBE_STEPS, round((settings.seconds - ready) / statistics.median(times[PROBE_STEPS // 4 :])))
+
+
+def _train_iterations(config: TrainerConfig, iterations: int, settings: ChartSettings) -> Run:
+    config = replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations)
+    start = settings.clock()
+    trainer = prepare(config)
+    ready = round(settings.clock() - start, 3)
+    return {"planned_steps": iterations, "ready_seconds": ready} | _train(trainer, ready, settings)
+
+
+def _train(trainer: Trainer, ready: float, settings: ChartSettings) -> Run:
+    model, pictures = trainer.pipeline.model, test_pictures(trainer.config)
+    counter = QueryCounter(model)
+    due = [seconds for seconds in EVAL_SECONDS if ready < seconds < settings.seconds]
+    curve, results, spent = [], {}, ready
+    for step in range(trainer.planned_steps):
+        start = settings.clock()
+        trainer.train_iteration(step)
+        spent += settings.clock() - start
+        last = step + 1 == trainer.planned_steps or spent >= settings.seconds
+        if last or (due and spent >= due[0]):
+            due = [seconds for seconds in due if seconds > spent]
+            queries = counter.queries
+            results = evaluate(model, pictures) if last else {"psnr": quick_psnr(model, pictures)}
+            counter.queries = queries
+            curve.append([round(spent, 3), step + 1, queries, round(results["psnr"], 3)])
+        if last:
+            break
+    outcome = measure_outcome(results, pictures, get_background_color(model))["outcome"]
+    seconds, steps, queries, _ = curve[-1]
+    run = {"psnr": results["psnr"], "outcome": outcome, "seconds": seconds, "steps": steps, "queries": queries}
+    return {**run, "curve": curve}
+
+
+def quick_psnr(model: RayModel, pictures: list[Picture]) -> float:
+    """Mean PSNR over the views, each of every third pixel."""
+    rows, values = slice(None, None, PIXEL_STRIDE), []
+    for picture in pictures:
+        rendered = render_rays(model, picture.rays(model.device)[rows]).clamp(0, 1).double()
+        truth = torch.from_numpy(composite_on(picture.image, get_background_color(model))).reshape(-1, 3)[rows]
+        values.append(psnr(float((rendered - truth).square().mean())))
+    return statistics.mean(values)
+
+
+class QueryCounter:
+    """Counts the points at which a model's networks are evaluated."""
+
+    def __init__(self, model: Any) -> None:
+        self.queries = 0
+        for network in model.networks:
+            getattr(model, network).register_forward_hook(self._add)
+
+    def _add(self, _: torch.nn.Module, inputs: tuple[Any, ...], __: Any) -> None:
+        self.queries += len(inputs[0])
