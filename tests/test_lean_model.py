@@ -14,7 +14,7 @@ import torch
 from tiny import cells, check_gradients, judged, tiny_model, tiny_rays
 from torch import Tensor
 
-from edge_se_sampler.bench.chart.variants import SAMPLER, changed
+from edge_se_sampler.bench.overrides import SAMPLER, override
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
@@ -284,7 +284,7 @@ def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: P
 def test_pixels_that_were_chosen_stay_chosen(by_alpha: bool, larger: Path, tmp_path: Path) -> None:
     config = lean_config(larger, tmp_path, cull_by_alpha=by_alpha)
     chosen = "edge" if by_alpha else "uniform"
-    sampler = prepare(changed(config, f"{SAMPLER}.early", chosen)).pipeline.datamanager.train_pixel_sampler
+    sampler = prepare(override(config, {f"{SAMPLER}.early": chosen})).pipeline.datamanager.train_pixel_sampler
     assert (sampler.strategy, sampler.config.schedule) == (chosen, "fraction")
 
 

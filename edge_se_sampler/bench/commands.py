@@ -7,7 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from edge_se_sampler.bench.chart.commands import BenchBeside, BenchChart
+from edge_se_sampler.bench.baselines.command import BenchBaselines
+from edge_se_sampler.bench.chart.command import BenchChart
 from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring, BenchStep
 from edge_se_sampler.bench.paper.command import BenchPaper
 from edge_se_sampler.bench.schedule.command import BenchSchedule
@@ -75,7 +76,7 @@ BENCHES: dict[str, type] = {
     "stability": BenchStability,
     "schedule": BenchSchedule,
     "chart": BenchChart,
-    "beside": BenchBeside,
+    "baselines": BenchBaselines,
     "step": BenchStep,
     "report": BenchReport,
 }

@@ -39,8 +39,8 @@ def fill_markers(path: Path, tables: Mapping[str, str]) -> None:
     except OSError as problem:
         raise InputError(f"{path}: cannot be read ({problem.strerror})") from problem
     for name, table in tables.items():
-        pattern = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(\n<!-- end -->)", re.DOTALL)
+        pattern = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
         if not pattern.search(text):
             raise InputError(f"{path}: has no marker <!-- table: {name} --> ... <!-- end -->")
-        text = pattern.sub(lambda found, new=table: found[1] + new + found[2], text)
+        text = pattern.sub(lambda found, new=table: f"{found[1]}{new}\n{found[2]}", text)
     write_atomically(path, text.encode())

@@ -53,7 +53,7 @@ def draw_chart(runs: list[Run], baselines: Sequence[dict[str, Any]], settings: C
         label=f"best: {', then '.join(best)}",
     )  # fmt: skip
     axis.set_ylabel("test PSNR [dB]")
-    axis.set_title(f"mean over {', '.join(scenes_of(shown_runs))}; bands: least to largest of the seeds", fontsize=9)
+    axis.set_title(f"scenes: {', '.join(scenes_of(shown_runs))}; bands: least to greatest of the seeds", fontsize=9)
     _finish(axis, time_label(settings))
     axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     figure.tight_layout()
@@ -141,7 +141,7 @@ def draw_scenes(runs: list[Run], baselines: Sequence[dict[str, Any]], settings: 
 def _styles(names: Collection[str]) -> dict[str, Style]:
     """The recommended variant black, methods solid, error sources dashed."""
     others = [name for name in names if name != RECOMMENDED]
-    lines = ("-" if VARIANTS[name].group == "methods" else "--" for name in others)
+    lines = ("--" if VARIANTS[name].group == "errors" else "-" for name in others)
     styles = {name: (f"C{i % 10}", line) for i, (name, line) in enumerate(zip(others, lines, strict=True))}
     return {name: styles.get(name, RECOMMENDED_STYLE) for name in names}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from edge_se_sampler.bench.baselines.results import name_of, read_baselines
 from edge_se_sampler.bench.chart.figures import MIB, draw_chart, draw_costs, draw_parts, draw_scenes
+from edge_se_sampler.bench.chart.reproduce import commands_of
 from edge_se_sampler.bench.chart.summary import (
     END,
     always_better,
@@ -49,7 +49,8 @@ def draw(folder: Path, workplace: Path | None) -> None:
     if len(comparable_groups(runs, TOP)) > 1:
         save_figure(draw_chart(runs, baselines, settings), folder / "chart.png")
         save_figure(draw_costs(runs), folder / "costs.png")
-    if groups := [group for group in _groups(runs) if group not in TOP and len(comparable_groups(runs, [group])) > 1]:
+    groups: list[Group] = [g for g in _groups(runs) if g not in TOP and len(comparable_groups(runs, [g])) > 1]
+    if groups:
         save_figure(draw_parts(runs, groups, settings), folder / "parts.png")
     save_figure(draw_scenes(runs, baselines, settings), folder / "scenes.png")
 
@@ -66,12 +67,16 @@ def describe(folder: Path) -> str:
             parts += [f"## {title}", text, _group_table(runs, group), *_ahead_and_behind(runs, group)]
         parts += _picture(folder, "parts")
         parts += [*_describe_comparisons(runs), *_describe_envelope(runs)]
-        parts += [*_describe_scenes(runs, baselines), *_picture(folder, "scenes"), *_describe_baselines(runs, baselines)]
+        parts += [
+            *_describe_scenes(runs, baselines),
+            *_picture(folder, "scenes"),
+            *_describe_baselines(runs, baselines),
+        ]
     if (folder / NOTES).exists():
         parts += ["## Remarks", (folder / NOTES).read_text(encoding="utf-8").strip()]
     parts += [
         "## Reproduce it",
-        f"```bash\n{chr(10).join(_commands(folder, runs, settings, baselines))}\n```",
+        f"```bash\n{chr(10).join(commands_of(folder, runs, settings, baselines))}\n```",
         "`edge-se bench report` writes this page and its pictures again from the numbers alone.",
         f"Measured on: {describe_machine(result['machine'])}.",
     ]
@@ -139,7 +144,9 @@ def _describe_methods(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> l
         psnr, name = max(others, key=lambda row: float(row[0]))
         text += f", the best of the other programs ({name}) at {psnr} dB"
     found = {name: runs_of(runs, name) for name in shown}
-    failures = [f"{VARIANTS[name].label} in {_failures(found[name])}" for name in found if any(map(failed, found[name]))]
+    failures = [
+        f"{VARIANTS[name].label} in {_failures(found[name])}" for name in found if any(map(failed, found[name]))
+    ]
     verdict = f"Trainings failed with {', '.join(failures)}; with no other method." if failures else "None failed."
     return [f"{text} (scenes and seeds that all have). {verdict}"]
 
@@ -153,9 +160,7 @@ def _group_table(runs: list[Run], group: Group) -> str:
         for name in shown
         if VARIANTS[name].group == group or name == RECOMMENDED
     ]
-    return markdown_table(
-        ["", *_seconds_head(seconds), "failed", "ms a step", "queries a step", "memory"], rows
-    )
+    return markdown_table(["", *_seconds_head(seconds), "failed", "ms a step", "queries a step", "memory"], rows)
 
 
 def _ahead_and_behind(runs: list[Run], group: Group) -> list[str]:
@@ -237,17 +242,18 @@ def _describe_scenes(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> li
     common = set.intersection(*({(r["scene"], r["seed"]) for r in found} for found in complete.values()))
     rows = []
     for name, found in complete.items():
-        ends = {s: [r for r in found if r["scene"] == s and (s, r["seed"]) in common] for s in scenes}
-        psnr = [statistics.median(run["curve"][-1][-1] for run in ends[scene]) for scene in scenes]
-        marks = [any("outcome" in run and failed(run) for run in ends[scene]) for scene in scenes]
-        cells = [f"({value:.2f})" if mark else f"{value:.2f}" for value, mark in zip(psnr, marks, strict=True)]
-        least = min(run["curve"][-1][-1] for of_scene in ends.values() for run in of_scene)
-        rows.append([name, *cells, f"{statistics.mean(psnr):.2f}", f"{least:.2f}", _failures(sum(ends.values(), []))])
-    seeds = sorted({seed for _, seed in common})
+        shown = [run for run in found if run["scene"] in scenes and (run["scene"], run["seed"]) in common]
+        cells, psnr = [], []
+        for of_scene in ([run for run in shown if run["scene"] == scene] for scene in scenes):
+            psnr.append(statistics.median(run["curve"][-1][-1] for run in of_scene))
+            any_failed = any("outcome" in run and failed(run) for run in of_scene)
+            cells.append(f"({psnr[-1]:.2f})" if any_failed else f"{psnr[-1]:.2f}")
+        least = min(run["curve"][-1][-1] for run in shown)
+        rows.append([name, *cells, f"{statistics.mean(psnr):.2f}", f"{least:.2f}", _failures(shown)])
     return [
         "## Every scene",
-        f"PSNR at the end, median over seeds ({_listed(seeds)}); in brackets where a training failed. *Least*: of a "
-        "single training.",
+        "PSNR at the end, on the scenes and seeds that all of these have; in brackets where a training failed. "
+        "*Least*: of a single training.",
         markdown_table(["", *scenes, "mean", "least", "failed"], rows),
     ]
 
@@ -256,14 +262,14 @@ def _describe_baselines(runs: list[Run], baselines: Sequence[dict[str, Any]]) ->
     if not baselines:
         return []
     seconds = _shown_seconds(runs)
-    rows = [[name, *fields] for name, fields in _baseline_rows(runs, baselines)]
-    flags = [f"- {name_of(b)}: version {b['settings']['program_version']}, `{b['settings']['flags']}`" for b in baselines]
+    versions = [baseline["settings"]["program_version"] for baseline in baselines]
+    rows = [[name, v, *fields] for v, (name, fields) in zip(versions, _baseline_rows(runs, baselines), strict=True)]
     return [
         "## Other programs (baselines)",
         "They run unchanged, by the same clock, on the same data and test views, with smaller settings than their "
-        "own, because no CPU gets anywhere with those; others may find better flags. Whether they failed is not known.",
-        markdown_table(["", *_seconds_head(seconds)], rows),
-        "\n".join(flags),
+        "own (flags below), because no CPU gets anywhere with those; others may find better flags. Whether they failed "
+        "is not known.",
+        markdown_table(["", "version", *_seconds_head(seconds)], rows),
     ]
 
 
@@ -296,52 +302,3 @@ def _cost_fields(runs: list[Run]) -> list[str]:
     queries = statistics.median(run["queries"] / run["steps"] for run in runs)
     memory = statistics.median(run["peak_bytes"] for run in runs) / MIB
     return [f"{step:.1f}", f"{queries:,.0f}", f"{memory:,.0f} MiB"]
-
-
-def _listed(values: Iterable[Any]) -> str:
-    return ", ".join(map(str, values))
-
-
-def _commands(
-    folder: Path, runs: list[Run], settings: ChartSettings, baselines: Sequence[dict[str, Any]]
-) -> list[str]:
-    """Commands that train exactly the runs that there are, baselines first."""
-    output = ["--output-dir", f"configs/{folder.name}"]
-    shared = []
-    if settings.seconds != ChartSettings.seconds:
-        shared += ["--seconds", f"{settings.seconds:g}"]
-    if settings.threads != ChartSettings.threads:
-        shared += ["--threads", f"{settings.threads}"]
-    if settings.image_size != ChartSettings.image_size:
-        shared += ["--data", "DIR"]
-    commands = []
-    for baseline in baselines:
-        of = baseline["settings"]
-        words = ["baselines", *output, "--program", of["program"], "--label", of["label"]]
-        words += ["--checkout", of["program"]] if not of["program"].startswith("nerfstudio-") else []
-        for _, scenes, seeds in _blocks([{**run, "variant": of["program"]} for run in baseline["runs"]]):
-            commands.append([*words, *_scene_flags(scenes, seeds), *shared, f"--flags={of['flags']}"])
-    for variants, scenes, seeds in _blocks(runs):
-        chosen = [] if set(variants) == set(VARIANTS) else ["--variants", *variants]
-        commands.append(["chart", *output, *chosen, *_scene_flags(scenes, seeds), *shared])
-    return [shlex.join(["edge-se", "bench", *words]) for words in commands]
-
-
-def _blocks(runs: list[Run]) -> list[tuple[list[str], list[str], list[int]]]:
-    """Runs as blocks of variants x scenes x seeds that share none."""
-    scenes_by_seeds: dict[str, dict[tuple[int, ...], list[str]]] = {}
-    for name in dict.fromkeys([*VARIANTS, *(run["variant"] for run in runs)]):
-        found = runs_of(runs, name)
-        for scene in scenes_of(found):
-            seeds = tuple(sorted(run["seed"] for run in found if run["scene"] == scene))
-            scenes_by_seeds.setdefault(name, {}).setdefault(seeds, []).append(scene)
-    blocks: dict[tuple[tuple[str, ...], tuple[int, ...]], list[str]] = {}
-    for name, by_seeds in scenes_by_seeds.items():
-        for seeds, scenes in by_seeds.items():
-            blocks.setdefault((tuple(scenes), seeds), []).append(name)
-    return [(variants, list(scenes), list(seeds)) for (scenes, seeds), variants in blocks.items()]
-
-
-def _scene_flags(scenes: Sequence[str], seeds: Sequence[int]) -> list[str]:
-    flags = [] if list(scenes) == ["bricks"] else ["--scenes", *scenes]
-    return flags if list(seeds) == [0, 1, 2] else [*flags, "--seeds", *map(str, seeds)]

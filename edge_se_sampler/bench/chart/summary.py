@@ -87,9 +87,9 @@ def differences(runs: list[Run], first: str, second: str, seconds: float) -> dic
         return {}
     ahead = {}
     for scene in scenes_of(by_variant[first]):
-        values = [mean_psnr_at(runs_of(by_variant[name], name, scene), seconds) for name in (first, second)]
-        if None not in values:
-            ahead[scene] = values[0] - values[1]
+        psnr, reference = (mean_psnr_at(runs_of(by_variant[v], v, scene), seconds) for v in (first, second))
+        if psnr is not None and reference is not None:
+            ahead[scene] = psnr - reference
     return ahead
 
 

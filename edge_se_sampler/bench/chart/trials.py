@@ -1,7 +1,8 @@
 """One training of the chart: test PSNR after seconds of training, under a plan that fills the time that it has.
 
 Training time runs from reading the data (scene analysis and tables included) to the end of a step; imports and
-evaluations are left out. Trainings on one thread are timed in CPU seconds, which other work on the machine changes little.
+evaluations are left out. Trainings on one thread are timed in CPU seconds, which other work on the machine hardly
+changes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_
 from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.session import prepare, test_pictures
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.ray_model import RayModel
 
 EVAL_SECONDS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)
@@ -83,7 +84,7 @@ def trials(variants: Sequence[str], scenes: Sequence[str], seeds: Sequence[int])
 def config_of(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
     """What a trial trains; its number of iterations is still open."""
     variant = VARIANTS[trial.variant]
-    config: TrainerConfig = override(registered_methods()[variant.method].specification.config, variant.changes)
+    config: TrainerConfig = override(method_configs()[variant.method], variant.changes)
     machine = MachineConfig(seed=trial.seed, device_type="cpu")  # seconds are a CPU's
     return replace(config, data=data, output_dir=output_dir, experiment_name=trial.name, machine=machine)
 
@@ -114,7 +115,7 @@ def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run
 
 
 def iterations_within(config: TrainerConfig, settings: ChartSettings) -> int:
-    """How many iterations fit into the training time: after reading the data, with steps as they are late in the plan."""
+    """How many iterations fit into the training time after reading the data, at the speed of the plan's last steps."""
     with tempfile.TemporaryDirectory() as folder:
         planned = 10_000
         start = settings.clock()

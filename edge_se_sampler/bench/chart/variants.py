@@ -14,6 +14,7 @@ TOP: tuple[Group, ...] = ("methods", "errors")
 """Groups that the main picture shows; the others change parts of the recommended method."""
 RECOMMENDED = "lean"
 """Every group is compared with this variant."""
+EDGE = {f"{SAMPLER}.early": "edge"}
 CACHED_ERRORS = {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"}
 
 
@@ -30,7 +31,7 @@ class Variant:
     @property
     def full_label(self) -> str:
         """The label where variants of several groups stand together."""
-        return self.label if self.group in TOP else f"lean-nerf, {self.label}"
+        return self.label if self.group in TOP else f"lean-nerf: {self.label}"
 
 
 VARIANTS: dict[str, Variant] = {
@@ -42,34 +43,34 @@ VARIANTS: dict[str, Variant] = {
     "edge": Variant("methods", LABELS["edge-nerf"], "edge-nerf"),
     "edge-se": Variant("methods", LABELS["edge-se-nerf"], "edge-se-nerf"),
     "edge-se-coarse": Variant(
-        "errors", "Edge + SE, errors of the coarse network", "edge-se-nerf", {f"{SAMPLER}.error_source": "coarse"}
+        "errors", "Edge + SE (errors of the coarse network)", "edge-se-nerf", {f"{SAMPLER}.error_source": "coarse"}
     ),
     "edge-se-cached": Variant(
-        "errors", "Edge + SE, cached errors", "edge-se-nerf", {f"{SAMPLER}.error_source": "cached"}
+        "errors", "Edge + SE (cached errors)", "edge-se-nerf", {f"{SAMPLER}.error_source": "cached"}
     ),
     "edge-se-adaptive": Variant(
-        "errors", "Edge + SE, adaptive schedule", "edge-se-nerf", {f"{SAMPLER}.schedule": "adaptive"}
+        "errors", "Edge + SE (adaptive schedule)", "edge-se-nerf", {f"{SAMPLER}.schedule": "adaptive"}
     ),
-    "lean-se": Variant("pixels", "SE, cached errors", changes=CACHED_ERRORS),
+    "lean-se": Variant("pixels", "SE (cached errors)", changes=CACHED_ERRORS),
     "lean-se-weighted": Variant(
-        "pixels", "SE, cached errors, weighted loss", changes=CACHED_ERRORS | {f"{SAMPLER}.importance_weight": 0.6}
+        "pixels", "SE (cached errors, weighted loss)", changes=CACHED_ERRORS | {f"{SAMPLER}.importance_weight": 0.6}
     ),
-    "lean-edge": Variant("pixels", "Edge", changes={f"{SAMPLER}.early": "edge"}),
-    "lean-edge-se": Variant("pixels", "Edge + SE, cached errors", changes={f"{SAMPLER}.early": "edge"} | CACHED_ERRORS),
+    "lean-edge": Variant("pixels", "Edge", changes=EDGE),
+    "lean-edge-se": Variant("pixels", "Edge + SE (cached errors)", changes=EDGE | CACHED_ERRORS),
     "lean-adaptive": Variant(
-        "pixels", "Edge + SE, cached errors, adaptive schedule",
-        changes={f"{SAMPLER}.early": "edge", f"{SAMPLER}.schedule": "adaptive"} | CACHED_ERRORS,
+        "pixels", "Edge + SE (cached errors, adaptive schedule)",
+        changes=EDGE | CACHED_ERRORS | {f"{SAMPLER}.schedule": "adaptive"},
     ),
     "lean-one-image": Variant("pixels", "one image a step", changes={f"{SAMPLER}.images_per_step": "one"}),
     "all-rays": Variant("parts", "rays that miss the hull too", changes={f"{MANAGER}.skip_empty_rays": False}),
     "no-hull": Variant("parts", "no hull", changes={f"{MODEL}.cull_by_alpha": False}),
     "no-hull-uniform": Variant(
-        "parts", "no hull, uniform pixels", changes={f"{MODEL}.cull_by_alpha": False, f"{SAMPLER}.early": "uniform"}
+        "parts", "no hull (uniform pixels)", changes={f"{MODEL}.cull_by_alpha": False, f"{SAMPLER}.early": "uniform"}
     ),
     "no-density": Variant("parts", "no pruning by density", changes={f"{MODEL}.cull_by_density": False}),
     "no-skipping": Variant("parts", "no empty-space skipping", changes={f"{MODEL}.empty_space_skipping": False}),
     "no-features": Variant(
-        "parts", "no features, network of 4 x 96",
+        "parts", "no features (network of 4 x 96)",
         changes={f"{MODEL}.feature_dim": 0, f"{MODEL}.depth": 4, f"{MODEL}.width": 96},
     ),
     "two-networks": Variant(
@@ -100,8 +101,8 @@ GROUPS: dict[Group, tuple[str, str]] = {
         "The paper's six strategies on the original NeRF, whose coarse and fine networks sample every ray along its "
         "whole length; and `lean-nerf`, whose one small network is evaluated only in the *hull*: the cells of space "
         "that no two views see to be background, by their alpha masks. The six use the masks for compositing alone; "
-        'what `lean-nerf` is without masks stands below as "no hull". On the original NeRF the choice of pixels decides '
-        "whether anything is learnt at all.",
+        'what `lean-nerf` is without masks stands below as "no hull". On the original NeRF the choice of pixels '
+        "decides whether anything is learnt at all.",
     ),
     "errors": (
         "Cheaper squared errors, and no fixed phase length",
@@ -112,12 +113,12 @@ GROUPS: dict[Group, tuple[str, str]] = {
     ),
     "pixels": (
         "Which pixels lean-nerf trains on",
-        "`lean-nerf` draws uniformly among the pixels whose rays meet the hull; here it draws by edges first, by cached "
-        "squared errors afterwards, or both. The weighted loss is the rule of [Soft Mining](https://ubc-vision.github."
-        "io/nf-soft-mining/) (Kheradmand et al. 2024), the nearest prior work: pixels by their error, the loss weighted "
-        "by their probability to the power of -0.6, its exponent; it finds the errors by Langevin moves instead. Where "
-        "the object's cells are known nothing dies, rays outside cost next to nothing, and the choice matters little: "
-        "so `lean-nerf` takes the simplest.",
+        "`lean-nerf` draws uniformly among the pixels whose rays meet the hull; here it draws by edges first, by "
+        "cached squared errors afterwards, or both. The weighted loss is the rule of [Soft Mining]"
+        "(https://ubc-vision.github.io/nf-soft-mining/) (Kheradmand et al. 2024), the nearest prior work: pixels by "
+        "their error, the loss weighted by their probability to the power of -0.6, its exponent; it finds the errors "
+        "by Langevin moves instead. Where the object's cells are known nothing dies, rays outside cost next to "
+        "nothing, and the choice matters little: so `lean-nerf` takes the simplest.",
     ),
     "parts": (
         "What lean-nerf's parts are worth",

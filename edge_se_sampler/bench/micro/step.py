@@ -14,8 +14,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.baselines.results import BaselineSettings
 from edge_se_sampler.bench.baselines.run import PROGRAMS, Clock, Task, TimeIsUp, version_of
-from edge_se_sampler.bench.chart.train import Scale
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, override
 from edge_se_sampler.bench.timing import time_interleaved
 from edge_se_sampler.engine.session import prepare
@@ -60,16 +60,17 @@ def _train_ours(pipe: Connection, data: Path, size: str, rays: int) -> None:
         changes |= {f"{MODEL}.size": size, f"{MANAGER}.train_num_rays_per_batch": rays}
         trainer = prepare(override(method_configs()["vanilla-nerf"], changes))
         turns = _Turns(pipe)
-        turns.begin()
+        turns.start()
         for step in range(trainer.planned_steps):
             trainer.train_iteration(step)
-            turns.step_over(lambda: 0.0)
+            turns.after_step(lambda: 0.0)
 
 
 def _train_nerf_pytorch(pipe: Connection, data: Path, checkout: Path) -> None:
     sys.path.insert(0, str(checkout.resolve()))
     with _silent_folder() as folder:
-        task = Task("nerf-pytorch", checkout, "--precrop_iters 0", data, 0, Scale())
+        settings = BaselineSettings(program="nerf-pytorch", flags="--precrop_iters 0", program_version="")
+        task = Task(settings, checkout, data, seed=0)
         PROGRAMS["nerf-pytorch"](task, folder, _Turns(pipe))
 
 
@@ -92,13 +93,13 @@ class _Turns(Clock):
     def __init__(self, pipe: Connection) -> None:
         self.pipe = pipe
 
-    def begin(self) -> None:
+    def start(self) -> None:
         try:
             self.pipe.recv()
         except EOFError:
             raise TimeIsUp from None
 
-    def step_over(self, psnr: Callable[[], float]) -> None:
+    def after_step(self, psnr: Callable[[], float]) -> None:
         del psnr
         self.pipe.send("done")
-        self.begin()
+        self.start()

@@ -1,0 +1,195 @@
+"""Other programs on the chart's scenes: stand-ins that train as they do are timed, evaluated, stopped, and kept."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_se_sampler.bench.baselines import run as run_module
+from edge_se_sampler.bench.baselines.results import BaselineSettings, name_of, read_baseline, read_baselines
+from edge_se_sampler.bench.baselines.run import Clock, Task, TimeIsUp, mean_psnr, train
+from edge_se_sampler.bench.chart.trials import ChartSettings
+from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.errors import InputError
+
+NERF_PYTORCH = """
+import sys, time
+import numpy as np
+import torch
+
+def render_path(poses, savedir=None, gt_imgs=None):
+    assert savedir is None  # nothing is written
+    time.sleep(0.3)
+    return np.full((1, 24, 24, 3), shade, dtype=np.float32), None
+
+def train():
+    global shade
+    assert "--datadir" in sys.argv
+    if "--wrong" in sys.argv:
+        sys.exit(2)
+    if "--short" in sys.argv:
+        return
+    shade = 1 - float(torch.rand(()))  # depends on the seed
+    while True:
+        time.sleep(0.02)
+        with torch.no_grad():
+            render_path(None, savedir="x", gt_imgs=None)
+"""
+TENSORF = """
+import sys
+import torch
+
+class Views:
+    img_wh = (24, 24)
+    all_rays = torch.zeros(1, 24 * 24, 6)
+
+def renderer(rays, model, N_samples, device):
+    assert (rays.shape, N_samples, device) == ((576, 6), 7, "cpu")
+    return torch.ones(576, 3) * model, None
+
+def evaluation(*_, **__):
+    raise AssertionError("needs a GPU")
+
+def config_parser():
+    assert sys.argv[sys.argv.index("--downsample_train") + 1] == str(800 / 24)
+    return sys.argv
+
+def reconstruction(args):
+    while True:
+        evaluation(Views(), 1.0, args, renderer, "folder", N_vis=5, N_samples=7, white_bg=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scenes(tmp_path_factory.mktemp("baselines"), ["mic"], size=24, num_train=2, num_val=1, num_test=1)[0]
+
+
+def checkout(folder: Path, name: str, text: str) -> Path:
+    """A git checkout of a program of one file."""
+    folder.mkdir()
+    (folder / name).write_text(text)
+    git = ["git", "-C", str(folder), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for command in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "a program"]):
+        subprocess.run([*git, *command], check=True)
+    return folder
+
+
+def test_the_clock_stands_still_during_an_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(ChartSettings, "clock", lambda _: now[0])
+    monkeypatch.setattr(run_module, "BASELINE_EVAL_SECONDS", (2, 7, 20))
+    clock = Clock(ChartSettings(seconds=10))
+
+    def evaluate() -> float:
+        now[0] += 50
+        return 20.0
+
+    def take_steps() -> None:
+        for _ in range(99):
+            now[0] += 1.5
+            clock.after_step(evaluate)
+
+    clock.start()
+    with pytest.raises(TimeIsUp):
+        take_steps()
+    assert clock.steps == 7
+    assert clock.curve == [[3.0, 20.0], [7.5, 20.0], [10.5, 20.0]]
+
+
+def test_every_seed_is_trained_and_kept(data: Path, tmp_path: Path, edge_se: Any) -> None:
+    program = checkout(tmp_path / "program", "run_nerf.py", NERF_PYTORCH)
+    options = ["--program", "nerf-pytorch", "--checkout", program, "--output-dir", tmp_path, "--data", data.parent,
+               "--scenes", "mic", "--seconds", 1, "--threads", 2, "--label", "4 x 64"]  # fmt: skip
+    for seeds in ([0], [0, 1]):
+        answer = edge_se("bench", "baselines", *options, "--flags=--netdepth 4", "--seeds", *seeds)
+        assert answer.code == 0, answer
+    path = tmp_path / "baselines" / "nerf-pytorch-4-x-64.json"
+    (result,) = read_baselines(tmp_path, ChartSettings(1, threads=2, image_size=24))
+    commit = subprocess.run(["git", "-C", program, "rev-parse", "HEAD"], capture_output=True, text=True).stdout
+    assert name_of(result) == "nerf-pytorch, 4 x 64"
+    assert result["settings"]["flags"] == "--netdepth 4"
+    assert commit.startswith(result["settings"]["program_version"])
+    first, second = result["runs"]
+    assert (first["scene"], first["seed"], second["seed"]) == ("mic", 0, 1)
+    ((seconds, psnr),) = first["curve"]
+    assert seconds >= 1
+    assert 0.02 * first["steps"] <= seconds  # evaluations, of 0.3 s, are neither steps nor training time
+    assert psnr != second["curve"][0][1]  # its own random numbers are seeded
+    before = path.read_bytes()
+    for wrong, message in (
+        (["--flags=--netdepth 5"], "other settings"),
+        (["--flags=--netdepth 4", "--seconds", 0], "at least 1"),
+    ):
+        answer = edge_se("bench", "baselines", *options, *wrong)
+        assert answer.code == 2, answer
+        assert message in answer.err
+        assert path.read_bytes() == before
+
+
+def test_a_program_that_refuses_its_flags_or_ends_early_is_named_in_one_line(
+    data: Path, tmp_path: Path, edge_se: Any
+) -> None:
+    program = checkout(tmp_path / "program", "run_nerf.py", NERF_PYTORCH)
+    options = ["--program", "nerf-pytorch", "--output-dir", tmp_path, "--data", data.parent, "--scenes", "mic"]
+    for more, message in (
+        (["--checkout", program, "--flags=--wrong"], "SystemExit: 2"),
+        (["--checkout", program, "--flags=--short"], "ended by itself after 0 steps"),
+        (["--checkout", tmp_path / "none"], "give a git checkout"),
+    ):
+        answer = edge_se("bench", "baselines", *options, *more)
+        assert answer.code == 2, answer
+        assert message in answer.err
+        assert len(answer.err.strip().splitlines()) == 1
+    assert not list(tmp_path.glob("baselines/*"))
+
+
+def test_a_program_whose_evaluation_needs_a_gpu_is_evaluated_without(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "BASELINE_EVAL_SECONDS", ())
+    settings = BaselineSettings(seconds=0.2, threads=2, program="tensorf", program_version="1", flags="")
+    run = train(Task(settings, checkout(tmp_path / "program", "train.py", TENSORF), data, seed=0))
+    ((_, psnr),) = run["curve"]
+    assert psnr == pytest.approx(mean_psnr([np.ones((24, 24, 3), np.float32)], data), abs=1e-3)
+
+
+# -- their files
+
+SETTINGS = {"seconds": 60, "threads": 1, "image_size": 100, "program": "other", "label": "", "program_version": "1",
+            "flags": "--fast"}  # fmt: skip
+RESULT = {
+    "version": 2, "experiment": "baselines", "command": "", "settings": SETTINGS, "machine": {}, "errors": [],
+    "runs": [{"scene": "mic", "seed": 0, "curve": [[1, 20.0], [2, 21.0]]}],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{", "[]", {**RESULT, "runs": 3}, {**RESULT, "version": 1},
+        {**RESULT, "settings": {key: value for key, value in SETTINGS.items() if key != "program_version"}},
+        {**RESULT, "runs": [{"scene": "mic", "seed": 0, "curve": [[2, 20.0], [1, 21.0]]}]},
+        {**RESULT, "runs": [{"scene": "mic", "seed": 0, "curve": []}]},
+        {**RESULT, "runs": [{"scene": "mic", "seed": 0, "curve": [[1, "much"]]}]},
+    ],
+)  # fmt: skip
+def test_a_file_of_another_format_is_refused(content: Any, tmp_path: Path) -> None:
+    path = tmp_path / "other.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InputError, match=r"other.json: not a result of edge-se bench"):
+        read_baseline(path, ChartSettings())
+
+
+@pytest.mark.parametrize(("field", "value"), [("threads", 2), ("image_size", 400)])
+def test_times_of_other_threads_or_image_sizes_are_refused(field: str, value: int, tmp_path: Path) -> None:
+    path = tmp_path / "other.json"
+    path.write_text(json.dumps({**RESULT, "settings": {**SETTINGS, field: value}}))
+    assert read_baseline(path, ChartSettings(**{field: value}))["runs"] == RESULT["runs"]
+    with pytest.raises(InputError, match=rf"other.json: {field} is {value}, the chart's is 1"):
+        read_baseline(path, ChartSettings())

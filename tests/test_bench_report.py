@@ -1,0 +1,64 @@
+"""Every committed README.md is what its results say now, and `edge-se bench report` writes it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge_se_sampler.bench.report import report_of
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+FOLDERS = sorted(path.parent for path in CONFIGS.rglob("README.md"))
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: str(folder.relative_to(CONFIGS)))
+def test_a_committed_readme_is_generated_from_its_results(folder: Path) -> None:
+    assert (folder / "README.md").read_text() == report_of(folder).describe(folder)
+
+
+def test_the_tables_of_the_main_readme_are_generated() -> None:
+    readme = (CONFIGS.parent / "README.md").read_text()
+    for name, table in report_of(CONFIGS / "chart").tables(CONFIGS / "chart").items():
+        assert f"<!-- table: {name} -->\n{table}\n<!-- end -->" in readme
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of a committed result."""
+    folder = tmp_path / "lean-ten-seeds"
+    folder.mkdir()
+    shutil.copy(CONFIGS / folder.name / "result.json", folder)
+    return folder
+
+
+def test_the_command_writes_the_readme_the_pictures_and_tables_of_another_text(
+    folder: Path, tmp_path: Path, edge_se: Any
+) -> None:
+    text = tmp_path / "text.md"
+    text.write_text("before\n<!-- table: methods -->\nold\n<!-- end -->\nafter\n")
+    answer = edge_se("bench", "report", folder, "--readme", text)
+    assert answer.code == 0, answer
+    assert (folder / "README.md").read_text() == (CONFIGS / folder.name / "README.md").read_text()
+    assert (folder / "scenes.png").exists()
+    lines = text.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("before", "after")
+    assert "old" not in lines
+    assert any(line.startswith("| lean-nerf |") for line in lines)
+
+
+def test_folders_without_results_and_texts_without_markers_are_refused(
+    folder: Path, tmp_path: Path, edge_se: Any
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "plain.md").write_text("no markers")
+    for options, message in (
+        ((tmp_path / "empty",), "no result of edge-se bench lies there"),
+        ((folder, "--readme", tmp_path / "none.md"), "cannot be read"),
+        ((folder, "--readme", tmp_path / "plain.md"), "has no marker <!-- table: methods -->"),
+    ):
+        answer = edge_se("bench", "report", *options)
+        assert answer.code == 2, answer
+        assert message in answer.err
