@@ -192,7 +192,7 @@ def test_one_image_of_more_than_two_to_the_24_pixels() -> None:
     assert drawn.shape == (100_000, 3)
     assert band_shares_are_right(drawn[:, 1])
     assert p_value(np.bincount(drawn[:, 2] // 64, minlength=64), np.full(64, 1 / 64)) > ALPHA
-    assert table.relative(torch.tensor([0]), torch.tensor([[0, 0, 0], [0, 4999, 4095]])).numpy() == pytest.approx(
+    assert table.density_ratio(torch.tensor([0]), torch.tensor([[0, 0, 0], [0, 4999, 4095]])).numpy() == pytest.approx(
         [0.5, 1.5], rel=1e-5
     )
 
@@ -320,13 +320,14 @@ def test_relative_is_probability_times_drawable_pixels() -> None:
     drawn = table.draw(chosen, 500, np.random.default_rng(0))
     scaled = [table.probability(image) * int(np.count_nonzero(IMAGES[image])) for image in chosen.tolist()]
     expected = [scaled[position][row, column] for position, row, column in drawn.tolist()]
-    np.testing.assert_allclose(table.relative(chosen, drawn).numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(table.density_ratio(chosen, drawn).numpy(), expected, rtol=1e-12)
 
 
 def test_relative_of_pixels_that_cannot_be_drawn_is_zero() -> None:
     table = table_of(*IMAGES)
     assert (
-        table.relative(torch.tensor([1, 5, 4]), torch.tensor([[0, 0, 0], [1, 0, 0], [2, 49, 49]])).tolist() == [0] * 3
+        table.density_ratio(torch.tensor([1, 5, 4]), torch.tensor([[0, 0, 0], [1, 0, 0], [2, 49, 49]])).tolist()
+        == [0] * 3
     )
 
 

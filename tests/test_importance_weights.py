@@ -11,7 +11,7 @@ from batches import LATE, MIXED, NUMBERS, SAME, batch_of, brightness, following,
 from goodness import mean_is
 from torch import Tensor
 
-from edge_se_sampler.sampling.edges import edge_strength
+from edge_se_sampler.sampling.edges import WHITE, edge_strength
 
 
 def batch_with_loss(sizes: Any, masks: list[Tensor]) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def test_edge_weights_are_the_inverse_of_probability_times_pixels() -> None:
     pixels = sampler.sample(batch_of(MIXED))
     for weight, (number, row, column) in zip(pixels["weight"].tolist(), pixels["indices"].tolist(), strict=True):
         image = batch_of(MIXED)["image"][NUMBERS.index(number)].numpy()
-        strength = sampler.strength("edge", image).astype(np.float64)
+        strength = sampler.strategies["edge"].distribution.strength(image, WHITE).astype(np.float64)
         assert weight == pytest.approx(strength.mean() / strength[row, column], rel=1e-5)
 
 

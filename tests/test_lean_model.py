@@ -276,7 +276,8 @@ def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: P
     assert "mask" not in views.image_batch
     loss = [trainer.train_iteration(step) for step in range(3)]
     assert all(np.isfinite(loss))
-    assert (views.train_pixel_sampler.strategy, views.train_pixel_sampler.watch.observations) == ("edge", 3)
+    sampler = views.train_pixel_sampler
+    assert (sampler.strategy, sampler.schedule.observations) == ("edge", 3)
     assert "pixels   edge until the object is learned, then uniform" in describe_run(trainer)
 
 

@@ -14,7 +14,6 @@ HEAVY = {"torch", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio"}
     ("module", "allowed"),
     [
         ("errors", set()),
-        ("sampling.schedule", set()),
         ("sampling.random_streams", set()),
         ("protocol", set()),
         ("sampling.settings", set()),

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from batches import NUMBERS, SAME, batch_of, brightness, following
+from batches import batch_of, brightness, following
 
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import STRATEGIES
-from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.strategies import (
+    DISTRIBUTIONS,
+    SELECTORS,
+    Distribution,
+    PixelBatch,
+    Selector,
+    TrainingStep,
+)
 
 
 def in_box(indices: torch.Tensor) -> bool:
@@ -76,20 +84,49 @@ def test_late_uniform_is_uniform_of_the_same_seed() -> None:
     assert all(torch.equal(late[0]["indices"], other["indices"]) for other in late[1:])
 
 
-class ByColumn(EdgeSEPixelSampler):
-    """A seventh way of choosing pixels: the further to the right, the likelier."""
+class ByColumn(Distribution):
+    """A custom distribution: the further to the right, the likelier."""
 
-    def strength(self, strategy: str, image: Any) -> Any:
-        if strategy != "right":
-            return super().strength(strategy, image)
-        return torch.arange(image.shape[1]).float().expand(image.shape[:2]).numpy()
+    name = "by-column"
+
+    def strength(self, image: np.ndarray, background_color: Any) -> np.ndarray:
+        return np.broadcast_to(np.arange(image.shape[1], dtype=np.float32), image.shape[:2]).copy()
 
 
-@pytest.mark.parametrize(("step", "settings"), [(0, {"early": "right"}), (500, {"late": "right"})])
-def test_a_seventh_way_joins_by_overriding_strength(step: int, settings: dict[str, Any]) -> None:
-    sampler = ByColumn(EdgeSEPixelSamplerConfig(**settings), num_rays_per_batch=20_000)
-    sampler.bind(squared_error=brightness, planned_steps=1000, seed=0)
-    sampler.set_step(step)
-    columns = sampler.sample(batch_of(SAME, NUMBERS))["indices"][:, 2]
+class Brightest(Selector):
+    """A custom selector: the candidates with the largest squared errors."""
+
+    name = "brightest"
+    candidates_per_pixel = 3
+
+    def select(self, candidates: PixelBatch, count: int, step: TrainingStep) -> PixelBatch:
+        assert step.squared_error is not None
+        rows = step.squared_error(candidates).topk(count).indices
+        return candidates.take(rows, torch.ones(count))
+
+
+@pytest.mark.parametrize(("step", "settings"), [(0, {"early": "by-column"}), (500, {"late": "by-column"})])
+def test_a_custom_distribution(step: int, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(DISTRIBUTIONS, "by-column", ByColumn)
+    sampler = following(step, rays=20_000, **settings)
+    assert sampler.strategy == "by-column"
+    columns = sampler.sample(batch_of())["indices"][:, 2]
     assert columns.min() == 1
     assert columns.double().mean() == pytest.approx(9, abs=0.15)  # sum j^2 / sum j of 0 .. 13
+
+
+def test_a_custom_selector(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SELECTORS, "brightest", Brightest)
+    scores = []
+
+    def score(candidates: dict[str, Any]) -> torch.Tensor:
+        scores.append(brightness(candidates))
+        return scores[-1]
+
+    trained = following(500, late="brightest", rays=50, squared_error=score).sample(batch_of())
+    torch.testing.assert_close(brightness(trained), scores[0].sort(descending=True).values[:50])
+
+
+def test_an_unknown_strategy_is_refused() -> None:
+    with pytest.raises(InputError, match="'egde' is none of uniform, precrop, edge, se"):
+        following(early="egde")

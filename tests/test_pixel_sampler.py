@@ -18,6 +18,7 @@ from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, Edge
 
 PHASES = {
     "uniform": {"step": 0, "early": "uniform"},
@@ -233,30 +234,30 @@ def test_tables_follow_the_absolute_number_not_the_position() -> None:
     sampler = following(planned=10**6)
     for subset in ([17, 2], [2, 17], [33, 17, 40], [9], [40, 33, 9, 17, 2]):
         batch = ImageBatch.of(batch_of([(9, 14)] * len(subset), subset), use_mask=True)
-        table, places = sampler.distribution(batch, "edge")
+        table, table_index = sampler.strategies["edge"].distribution.tables(batch)
         for k, number in enumerate(subset):
             alone = ImageBatch.of(batch_of(SAME[:1], [number]), use_mask=True)
-            fresh, place = following().distribution(alone, "edge")
+            fresh, _ = Edge(sampler.config).tables(alone)
             assert isinstance(table, PixelTable)
             assert isinstance(fresh, PixelTable)
-            p, expected = table.probability(int(places[k])), fresh.probability(int(place[0]))
+            p, expected = table.probability(int(table_index[k])), fresh.probability(0)
             torch.testing.assert_close(p, expected, rtol=1e-6, atol=2**-30)
             assert len(table) <= len(numbers)
 
 
-def test_an_images_strength_is_computed_once() -> None:
-    asked: list[bytes] = []
+def test_an_images_strength_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed: list[bytes] = []
 
-    class Counting(EdgeSEPixelSampler):
-        def strength(self, strategy: str, image: np.ndarray) -> np.ndarray:
-            asked.append(image.tobytes())
-            return super().strength(strategy, image)
+    class CountingEdge(Edge):
+        def strength(self, image: np.ndarray, background_color: Any) -> np.ndarray:
+            computed.append(image.tobytes())
+            return super().strength(image, background_color)
 
-    sampler = Counting(EdgeSEPixelSamplerConfig())
-    sampler.bind(squared_error=brightness, planned_steps=1000, seed=0)
+    monkeypatch.setitem(DISTRIBUTIONS, "edge", CountingEdge)
+    sampler = following()
     for subset in ([1, 2], [2, 3], [3, 1], [2]):
         sampler.sample(batch_of([(9, 14)] * len(subset), subset))
-    assert len(asked) == len(set(asked)) == 3
+    assert len(computed) == len(set(computed)) == 3
 
 
 # ---- nothing else changes

@@ -171,9 +171,9 @@ def test_a_checkpoint_keeps_the_adaptive_schedules_state(
     saved_after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Saved in the early phase, in the late one, and in the early one that follows: all three are forced."""
-    monkeypatch.setattr(schedule, "PAYS_NO_MORE", float("inf"))
-    monkeypatch.setattr(schedule, "LEARNT", 1e6)
-    monkeypatch.setattr(schedule, "LOST", 0.0)
+    monkeypatch.setattr(schedule, "GAIN_TO_END", float("inf"))
+    monkeypatch.setattr(schedule, "REMAINING_TO_END", 1e6)
+    monkeypatch.setattr(schedule, "REMAINING_TO_RETURN", 0.0)
     trainer = trainer_of(tmp_path, "edge-se-nerf", schedule="adaptive")
     sampler: Any = trainer.pipeline.datamanager.train_pixel_sampler
     for step in range(saved_after):

@@ -61,31 +61,31 @@ def test_a_sampler_refuses_them_when_it_is_made(flag: str, settings: dict[str, A
         {"early": "uniform", "late": "uniform"},
     ],
 )
-def test_accepted_to_the_very_limits(settings: dict[str, Any]) -> None:
-    made = SamplingSettings(**settings)
-    made.check()
-    assert made == SamplingSettings(**settings)
+def test_values_at_their_limits_are_accepted(settings: dict[str, Any]) -> None:
+    checked = SamplingSettings(**settings)
+    checked.check()
+    assert checked == SamplingSettings(**settings)
 
 
 @pytest.mark.parametrize(
-    ("settings", "located", "early", "schedule"),
+    ("settings", "has_masks", "early", "schedule"),
     [
         ({"early": "auto"}, True, "uniform", "fraction"),
-        ({"early": "auto"}, False, "edge", "auto"),
-        ({"early": "auto", "schedule": "adaptive"}, True, "edge", "adaptive"),  # somebody wants to watch
+        ({"early": "auto"}, False, "edge", "adaptive"),
+        ({"early": "auto", "schedule": "adaptive"}, True, "edge", "adaptive"),
         ({"early": "precrop"}, True, "precrop", "fraction"),
         ({"early": "uniform"}, False, "uniform", "fraction"),
     ],
 )
-def test_what_is_automatic_is_decided_by_whether_the_object_is_located(
-    settings: dict[str, Any], located: bool, early: str, schedule: str
+def test_auto_is_resolved_by_whether_masks_tell_where_the_object_is(
+    settings: dict[str, Any], has_masks: bool, early: str, schedule: str
 ) -> None:
     config = EdgeSEPixelSamplerConfig(**settings)
-    decided = config.resolve_auto(located)
-    assert (decided.early, decided.schedule) == (early, schedule)
-    decided.check()
-    if not located:  # nor does a sampler know by itself
-        assert config.setup().config == decided
+    resolved = config.resolve_auto(has_masks)
+    assert (resolved.early, resolved.schedule) == (early, schedule)
+    resolved.check()
+    if not has_masks:  # nor does a sampler know of any
+        assert config.setup().config == resolved
 
 
 def test_defaults_are_the_papers_edge_and_squared_error() -> None:

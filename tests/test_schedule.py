@@ -1,10 +1,10 @@
-"""Which phase a step is in."""
+"""Which phase a step is in under a fixed schedule."""
 
 from __future__ import annotations
 
 import pytest
 
-from edge_se_sampler.sampling.schedule import phase_at
+from edge_se_sampler.sampling.schedule import FixedSchedule
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig, SamplingSettings
 
 
@@ -23,15 +23,15 @@ from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig, Sampling
     ],
 )
 def test_early_while_the_step_is_below_the_length(step: int, early_steps: float, phase: str) -> None:
-    assert phase_at(step, early_steps) == phase
+    assert FixedSchedule(early_steps).phase(step) == phase
 
 
 @pytest.mark.parametrize("planned", [1, 9, 10, 11, 70, 230, 1000, 15_000, 200_000, 300_007])
 def test_the_papers_tenth_is_exact(planned: int) -> None:
-    length = SamplingSettings().early_length(planned)
+    schedule = FixedSchedule(SamplingSettings().early_length(planned))
     tenth = -(-planned // 10)  # step < planned / 10 holds for this many steps
     around = range(max(tenth - 2, 0), tenth + 3)
-    assert [phase_at(step, length) == "early" for step in around] == [step < tenth for step in around]
+    assert [schedule.phase(step) == "early" for step in around] == [step < tenth for step in around]
 
 
 @pytest.mark.parametrize(

@@ -117,4 +117,4 @@ def test_extreme_random_numbers_stay_in_the_box(size: tuple[int, int], fraction:
 def test_every_image_can_be_drawn_and_no_pixel_is_special() -> None:
     pixels = UniformPixels([(3, 4), (1, 1)], 0.5)
     assert pixels.drawable(torch.tensor([1, 0])).tolist() == [True, True]
-    assert pixels.relative(torch.tensor([0]), torch.tensor([[0, 1, 1], [0, 1, 2]])).tolist() == [1, 1]
+    assert pixels.density_ratio(torch.tensor([0]), torch.tensor([[0, 1, 1], [0, 1, 2]])).tolist() == [1, 1]

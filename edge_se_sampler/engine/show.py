@@ -15,15 +15,15 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.distribution import PixelTable
 from edge_se_sampler.sampling.edges import luma, unit_float
 from edge_se_sampler.sampling.image_batch import ImageBatch
-from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, Distribution
 
 
-def probability_map(sampler: EdgeSEPixelSampler, batch: ImageBatch, strategy: str, k: int) -> np.ndarray:
+def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np.ndarray:
     """p of every pixel of the view at position k, (H, W); sums to 1 (or is 0 where all is masked)."""
     table = PixelTable()
-    strength = torch.from_numpy(sampler.strength(strategy, batch.image(k)))
+    strength = torch.from_numpy(distribution.strength(batch.image(k), batch.background_color))
     table.add([strength if batch.mask is None else strength * batch.valid(k)])
     return table.probability(0).numpy()
 
@@ -41,13 +41,14 @@ def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Pa
         InputError: matplotlib is missing, or the settings do not fit the images.
     """
     pyplot = require_pyplot()
-    sampler = EdgeSEPixelSampler(config)
+    config.check()
+    distribution = DISTRIBUTIONS[strategy](config)
     batch = ImageBatch.of(image_batch(views), use_mask=not config.ignore_mask)
     chosen = np.unique(np.linspace(0, len(views.images) - 1, num_views).round().astype(int)).tolist()
     figure, axes = pyplot.subplots(len(chosen), 3, figsize=(9.6, 3.35 * len(chosen)), squeeze=False)
     for row, k in zip(axes, chosen, strict=True):
         try:
-            p = probability_map(sampler, batch, strategy, k)
+            p = probability_map(distribution, batch, k)
         except ValueError as problem:
             raise InputError(f"{views.names[k]}: {problem}") from problem
         _show_view(row, views, k, p, strategy, config.num_rays_per_batch, stream(seed, k, Stream.PIXELS))

@@ -14,8 +14,9 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
-from edge_se_sampler.nerfstudio.planned import planned_steps, remember_watch
-from edge_se_sampler.nerfstudio.scoring import get_background_color, ray_errors, watch_training
+from edge_se_sampler.nerfstudio.resume import planned_steps, restore_schedule, schedule_writer
+from edge_se_sampler.nerfstudio.scoring import get_background_color, observe_training_errors, ray_errors
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 from edge_se_sampler.sampling.scoring import scoring
 from edge_se_sampler.sampling.settings import SamplingSettings
 
@@ -30,7 +31,7 @@ class EdgeSEDataManager(VanillaDataManager):
         if important and self.config.patch_size > 1:
             raise InputError(f"patch-size is {self.config.patch_size}: important pixels are not drawn in patches")
         evaluation = dataset is not self.train_dataset
-        self.config.pixel_sampler = _plain(shared) if important and evaluation else copy.copy(shared)
+        self.config.pixel_sampler = _uniform_config(shared) if important and evaluation else copy.copy(shared)
         try:
             return super()._get_pixel_sampler(dataset, num_rays_per_batch)
         finally:
@@ -40,7 +41,7 @@ class EdgeSEDataManager(VanillaDataManager):
         """nerfstudio's callbacks and ours; called once the checkpoint, if there is one, has been loaded."""
         callbacks = super().get_training_callbacks(training_callback_attributes)
         if isinstance(self.train_pixel_sampler, EdgeSEPixelSampler):
-            callbacks += _follow(self, training_callback_attributes.trainer)
+            callbacks += _bind_sampler(self, training_callback_attributes.trainer)
         return callbacks
 
 
@@ -73,15 +74,15 @@ def attach(trainer: Any, **settings: Any) -> None:
     sampler = manager.train_pixel_sampler
     if type(sampler) is not PixelSampler:
         raise InputError(f"the training sampler is a {type(sampler).__name__}: important pixels would not do its work")
-    config = EdgeSEPixelSamplerConfig(**(_known(sampler.config) | settings))
+    config = EdgeSEPixelSamplerConfig(**(_shared_settings(sampler.config) | settings))
     manager.train_pixel_sampler = config.setup(num_rays_per_batch=sampler.num_rays_per_batch)
-    trainer.callbacks += _follow(manager, trainer)
+    trainer.callbacks += _bind_sampler(manager, trainer)
 
 
-def _follow(manager: Any, trainer: Any) -> list[TrainingCallback]:
-    """Bind a data manager's training sampler to the run; the callbacks tell it the step, and keep what it watches."""
+def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
+    """Bind a data manager's training sampler to the run; callbacks that set its step and write its schedule's state."""
     sampler, config = manager.train_pixel_sampler, trainer.config
-    sampler.background = get_background_color(trainer.pipeline.model)
+    sampler.background_color = get_background_color(trainer.pipeline.model)
     sampler.bind(
         squared_error=scoring(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
         planned_steps=planned_steps(trainer),
@@ -90,22 +91,23 @@ def _follow(manager: Any, trainer: Any) -> list[TrainingCallback]:
         world=trainer.world_size,
     )
     callbacks = [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
-    if sampler.watch is not None or sampler.memory is not None:
-        watch_training(trainer.pipeline.model, sampler)
-    if sampler.watch is not None:
-        keep = remember_watch(trainer, sampler.watch)
-        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], keep))
+    if sampler.needs_errors:
+        observe_training_errors(trainer.pipeline.model, sampler)
+    if isinstance(sampler.schedule, AdaptiveSchedule):
+        restore_schedule(trainer, sampler.schedule)
+        write_schedule = schedule_writer(trainer, sampler.schedule)
+        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], write_schedule))
     loader = manager.train_image_dataloader
     if loader.cache_all_images:
         sampler.check_images(loader.cached_collated_batch)
     return callbacks
 
 
-def _plain(shared: PixelSamplerConfig) -> PixelSamplerConfig:
+def _uniform_config(shared: PixelSamplerConfig) -> PixelSamplerConfig:
     """nerfstudio's own uniform sampler with the settings of ours that it knows."""
-    return PixelSamplerConfig(**_known(shared))
+    return PixelSamplerConfig(**_shared_settings(shared))
 
 
-def _known(config: PixelSamplerConfig) -> dict[str, Any]:
+def _shared_settings(config: PixelSamplerConfig) -> dict[str, Any]:
     """The settings that nerfstudio's sampler and ours have in common."""
     return {f.name: getattr(config, f.name) for f in fields(PixelSamplerConfig) if f.name != "_target"}

@@ -44,7 +44,7 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
         if self.error_source == "coarse":
             raise InputError(
                 f"pixel-sampler.error-source is {self.error_source!r}: nerfstudio's models render their coarse colours "
-                "only together with the fine ones; take exact or memory"
+                "only together with the fine ones; take fine or cached"
             )
         # both come from the cameras: the host's sampler then draws by solid angle, or inside the crop circle alone
         if bool(self.is_equirectangular):
@@ -58,12 +58,12 @@ class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """As ImportantPixels.sample; a sampler that follows no training run says so, once, and draws uniformly."""
-        if not self.is_bound and not self._told:
-            self._told = True
+        if not self.is_bound and not self._warned:
+            self._warned = True
             print(UNBOUND, file=sys.stderr)
         return super().sample(image_batch)
 
-    _told = False
+    _warned = False
 
     def __getstate__(self) -> Any:
         """Refuse to be sent to a worker process (nerfstudio's ParallelDataManager), where no model could be asked."""

@@ -1,4 +1,4 @@
-"""The squared errors of nerfstudio's models on candidate pixels, found without a trace left in the model."""
+"""The squared errors of nerfstudio's models at drawn pixels, computed without changing the model's state."""
 # pyright: reportMissingImports=false
 # nerfstudio's pins rule out the environment that is linted; here its classes count as unknown
 
@@ -15,13 +15,12 @@ from torch import Tensor, nn
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.edges import WHITE
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
-from edge_se_sampler.sampling.schedule import AdaptiveSchedule
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule, Schedule
 
 BLACK = (0.0, 0.0, 0.0)
-HOPELESS_AFTER = 1000
-"""Iterations."""
-HOPELESS = 0.98
-"""Share of an empty scene's error."""
+DEAD_CHECK_STEPS = 1000
+DEAD_ERROR_SHARE = 0.98
+"""A model whose error is still above this share of an empty scene's after so many iterations is reported as dead."""
 
 
 def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
@@ -30,7 +29,7 @@ def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
     Raises:
         InputError: the model renders neither "rgb" nor "rgb_fine".
     """
-    with _without_trace(model):
+    with _preserved_state(model):
         return squared_errors(model, model(ray_bundle), batch["image"])
 
 
@@ -45,7 +44,9 @@ def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Ten
     """
     level = next((level for level in ("", "_fine") if f"rgb{level}" in outputs), None)
     if level is None:
-        raise InputError(f"{type(model).__name__} renders neither rgb nor rgb_fine: its errors cannot be told")
+        raise InputError(
+            f"{type(model).__name__} renders neither rgb nor rgb_fine: its squared errors cannot be computed"
+        )
     colors = outputs[f"rgb{level}"]
     image = image.to(colors.device)
     if image.dtype == torch.uint8:
@@ -59,38 +60,40 @@ def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Ten
     return (colors.float() - image[:, :3]).square().sum(dim=1)
 
 
-def watch_training(model: nn.Module, sampler: ImportantPixels) -> None:
-    """Tell the sampler the errors of every training batch that the model renders (for the adaptive schedule and cached
-    errors).
+def observe_training_errors(model: nn.Module, sampler: ImportantPixels) -> None:
+    """Give the sampler the squared errors of every training batch that the model renders, by a forward hook.
 
-    Evaluation is not in training mode, and while candidates are scored the sampler waits for no batch.
+    Evaluation is not in training mode, and while candidates are scored the sampler has no pending batch.
     """
 
     def observe(module: nn.Module, _: Any, outputs: dict[str, Tensor]) -> None:
-        batch = sampler.pending_batch
-        if not module.training or batch is None:
+        pending = sampler.pending_batch
+        if not module.training or pending is None:
             return
+        image = pending.values["image"]
         with torch.no_grad():
-            errors = squared_errors(module, outputs, batch["image"])
-        if len(errors) == len(batch["image"]):
+            errors = squared_errors(module, outputs, image)
+        if len(errors) == len(image):
             sampler.observe(errors)
-            _warn_of_the_dead(sampler.watch)
+            _warn_if_dead(sampler.schedule)
 
     model.register_forward_hook(observe)
 
 
-def _warn_of_the_dead(watch: AdaptiveSchedule | None) -> None:
-    """Once, in the log: what a sampler cannot help."""
-    if watch is not None and watch.observations == HOPELESS_AFTER and watch.remaining > HOPELESS:
+def _warn_if_dead(schedule: Schedule) -> None:
+    """Say once that the model has learnt nothing, which no sampler can mend."""
+    if not isinstance(schedule, AdaptiveSchedule) or schedule.observations != DEAD_CHECK_STEPS:
+        return
+    if schedule.remaining > DEAD_ERROR_SHARE:
         print(
-            f"edge-se-sampler: after {HOPELESS_AFTER} iterations nothing of the object is learnt. Its density may be "
+            f"edge-se-sampler: after {DEAD_CHECK_STEPS} iterations nothing of the object is learnt. The density may be "
             "dead (negative everywhere, no gradient), which no choice of pixels can help: try another --machine.seed",
             file=sys.stderr,
         )
 
 
 @contextmanager
-def _without_trace(model: nn.Module) -> Iterator[None]:
+def _preserved_state(model: nn.Module) -> Iterator[None]:
     """Render as training does, pose corrections and all, and leave everything as it was.
 
     The random numbers are others than the training pass will see, and the host's generators go on from where they

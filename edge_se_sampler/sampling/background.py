@@ -1,4 +1,4 @@
-"""What an empty scene would show at a pixel: the background, and how far a pixel's colour is from it."""
+"""What an empty scene would show at a pixel: the background, and how far a pixel's color is from it."""
 
 from __future__ import annotations
 
@@ -7,70 +7,71 @@ import numpy as np
 from edge_se_sampler.sampling.edges import unit_float
 from edge_se_sampler.sampling.image_batch import ImageBatch
 
-VISIBLE = 0.01
-"""A pixel farther than this from the background shows the object: a tenth of the full contrast in one channel."""
+MIN_OBJECT_DISTANCE = 0.01
+"""Squared distance from the background above which a pixel shows the object: a tenth of the full contrast in one
+channel."""
 
 
-def summed_up(
-    error: np.ndarray, distance: np.ndarray, relative: np.ndarray, by_edge: bool, kept: np.ndarray | float = 1.0
+def summarize_errors(
+    error: np.ndarray, distance: np.ndarray, edge_ratio: np.ndarray, density_ratio: np.ndarray
 ) -> tuple[float, float, float, float]:
-    """What a step's pixels say of both ways of drawing, by importance weights (see `schedule`).
+    """Means under both ways of drawing, by importance weights, from pixels drawn in any way; symbols as in `schedule`.
 
     Args:
         error: (n,) e.
         distance: (n,) b, see `PlainBackgrounds.squared_distance`.
-        relative: (n,) p / u.
-        by_edge: whether edge sampling drew them; else uniform sampling did.
-        kept: (n,) how much likelier than on average each was kept of what was drawn.
+        edge_ratio: (n,) p/u.
+        density_ratio: (n,) probability with which each pixel was really drawn, over u.
 
     Returns:
-        how many show the object, E[e], E[b], U[e].
+        how many pixels show the object, E[e], E[b], U[e].
     """
-    as_edge, as_uniform = (1.0, 1 / relative) if by_edge else (relative / kept, 1 / kept)
+    as_edge, as_uniform = edge_ratio / density_ratio, 1 / density_ratio
     means = (np.mean(values) for values in (error * as_edge, distance * as_edge, error * as_uniform))
     edge_error, edge_background, uniform_error = map(float, means)
-    return float(np.count_nonzero(distance > VISIBLE)), edge_error, edge_background, uniform_error
+    return float(np.count_nonzero(distance > MIN_OBJECT_DISTANCE)), edge_error, edge_background, uniform_error
 
 
 class PlainBackgrounds:
-    """The backgrounds of images: of those with alpha what the model is rendered on, of others their border's median."""
+    """Backgrounds of images: for those with alpha the color the model is rendered on, for others their border's
+    median."""
 
     def __init__(self) -> None:
-        self._numbers = np.zeros(0, dtype=np.int64)
+        self._numbers = np.zeros(0, dtype=np.int64)  # ascending
         self._colors = np.zeros((0, 3), dtype=np.float32)
 
-    def look_at(self, batch: ImageBatch) -> None:
-        """Remember the borders of images that are new, unless they have alpha."""
+    def add(self, batch: ImageBatch) -> None:
+        """Take up the borders of images that are new, unless they have alpha."""
         if batch.channels == 4:
             return
         numbers = batch.numbers.cpu().numpy()
         new = np.flatnonzero(~np.isin(numbers, self._numbers)).tolist()
         if new:
-            colors = np.concatenate((self._colors, [_border(batch.image(k)) for k in new]))
+            colors = np.concatenate((self._colors, [_border_color(batch.image(k)) for k in new]))
             self._numbers = np.concatenate((self._numbers, numbers[new]))
             order = np.argsort(self._numbers)
             self._numbers, self._colors = self._numbers[order], colors[order]
 
     def squared_distance(
-        self, image: np.ndarray, numbers: np.ndarray, behind: tuple[float, float, float]
+        self, image: np.ndarray, numbers: np.ndarray, background_color: tuple[float, float, float]
     ) -> np.ndarray:
-        """b (n,) of pixels of images looked at.
+        """b (n,) of pixels of images that were added.
 
         Args:
             image: (n, 3|4) pixels, uint8 or float in [0, 1].
             numbers: (n,) of their images.
-            behind: what images with alpha are composited on, RGB in [0, 1].
+            background_color: RGB in [0, 1] that images with alpha are composited on.
         """
         image = unit_float(image[None])[0]
         if image.shape[1] == 4:
-            away = image[:, 3:] * (image[:, :3] - np.array(behind, dtype=np.float32))
+            difference = image[:, 3:] * (image[:, :3] - np.array(background_color, dtype=np.float32))
         else:
-            away = image - self._colors[np.searchsorted(self._numbers, numbers)]
-        return np.square(away).sum(axis=1)
+            difference = image - self._colors[np.searchsorted(self._numbers, numbers)]
+        return np.square(difference).sum(axis=1)
 
 
-def _border(image: np.ndarray) -> np.ndarray:
-    """(3,) median colour of the outermost pixels."""
+def _border_color(image: np.ndarray) -> np.ndarray:
+    """(3,) median color of the outermost pixels."""
     image = unit_float(image)
     border = np.concatenate((image[0], image[-1], image[:, 0], image[:, -1]))
     return np.median(border, axis=0).astype(np.float32)

@@ -56,7 +56,7 @@ class UniformPixels:
         pixel = (self.low[image] + torch.floor(u[:, 1:] * self.extent[image])).long()
         return torch.cat((which[:, None], pixel), dim=1)
 
-    def relative(self, images: Tensor, drawn: Tensor) -> Tensor:
+    def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) p of the drawn pixels times the number of pixels that can be drawn in their image: here 1."""
         return torch.ones(len(drawn), dtype=torch.float64)
 
@@ -160,10 +160,10 @@ class PixelTable:
         height, width = self._shape[image].tolist()
         columns = torch.arange(height * width)
         drawn = torch.stack((torch.zeros_like(columns), columns // width, columns % width), dim=1)
-        relative = self.relative(torch.tensor([image]), drawn).reshape(height, width)
+        relative = self.density_ratio(torch.tensor([image]), drawn).reshape(height, width)
         return relative / max(int(self._support[image]), 1)
 
-    def relative(self, images: Tensor, drawn: Tensor) -> Tensor:
+    def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) p of drawn pixels (as `draw` returns them) times the number of drawable pixels of their image."""
         which, row, column = drawn.numpy().T
         image = images.numpy()[which]

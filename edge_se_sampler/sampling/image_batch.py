@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from edge_se_sampler.sampling.edges import WHITE
+
 
 @dataclass(frozen=True)
 class ImageBatch:
@@ -26,10 +28,14 @@ class ImageBatch:
     """Key -> k tensors (H, W, ...), stacked or in a list; "image" among them."""
     mask: Any
     """k tensors (H, W, 1), non-zero where a pixel may be drawn; None: everywhere."""
+    background_color: tuple[float, float, float] = WHITE
+    """RGB in [0, 1] behind transparent pixels."""
 
     @classmethod
-    def of(cls, image_batch: dict[str, Any], *, use_mask: bool) -> ImageBatch:
-        """Read a host's batch.
+    def of(
+        cls, image_batch: dict[str, Any], *, use_mask: bool, background_color: tuple[float, float, float] = WHITE
+    ) -> ImageBatch:
+        """Read a host's batch, see the protocol's `PixelSampler.sample`.
 
         Raises:
             ValueError: a key that is neither stacked (k, H, W, ...) nor a list of k (H, W, ...), or another number
@@ -42,7 +48,13 @@ class ImageBatch:
         for key, value in per_pixel.items():
             if _sizes(value) != sizes:
                 raise ValueError(f"image batch: {key!r} has not one (H, W, ...) tensor for each image")
-        return cls(image_batch["image_idx"], sizes, per_pixel, per_pixel.get("mask") if use_mask else None)
+        mask = per_pixel.get("mask") if use_mask else None
+        return cls(image_batch["image_idx"], sizes, per_pixel, mask, background_color)
+
+    @property
+    def sizes_by_number(self) -> dict[int, tuple[int, int]]:
+        """Image number -> rows, columns."""
+        return dict(zip(self.numbers.tolist(), self.sizes, strict=True))
 
     @property
     def device(self) -> torch.device:

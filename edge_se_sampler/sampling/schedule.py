@@ -1,55 +1,100 @@
-"""Which phase a training step is in: early for a planned length (the paper: a tenth), or for as long as it pays.
+"""Which phase a training step is in: early for a planned length (the paper: a tenth), or for as long as edges pay.
 
 e      squared error of a pixel
-b      squared distance of its colour from the background's: its error in an empty scene
+b      squared distance of its color from the background's: its error in an empty scene
 p, u   probability of a pixel under edge sampling, and under uniform sampling
 E, U   means over pixels as edge sampling draws them, and as uniform sampling does
-R      E[e] / E[b]: 1 for an empty scene, 0 where all is learnt. The background's pixels count in e: a fog in front of
-       everything, as networks begin with, is nearer to many an object than its background
+R      E[e] / E[b]: 1 for an empty scene, 0 where everything is learnt. Pixels of the background count in e: a fog in
+       front of everything, as networks begin with, may be nearer to an object's color than the background is
 """
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from typing import Any, Literal
+
+from torch import Tensor
+
+from edge_se_sampler.sampling.background import PlainBackgrounds, summarize_errors
+from edge_se_sampler.sampling.strategies import Distribution, PixelBatch, SamplerPart, TrainingStep
 
 Phase = Literal["early", "late"]
 
-LEARNT, LOST = 0.5, 0.8
-"""The early phase does not end before R is below the first, and begins again when R is above the second."""
-PAYS_NO_MORE, PAYS_AGAIN = 4.0, 4.5
-"""Nor before E[e] / U[e], the error that edge sampling finds with as many pixels as uniform sampling, is below the
-first; above the second it begins again. Chosen on seed 100. In 300 iterations, PSNR for (2, 3), (3, 4), (4, 6), (6, 9):
-drums, centred, 18.60, 19.01, 19.56, 19.56 (a tenth of edges: 19.62), bricks, centred, 21.39, 21.42, 21.72, 21.72
-(21.99), chair, off centre, 25.69, 25.56, 25.56, 24.69 (24.36), mic, off centre, 29.26, 28.90, 28.90, 28.90 (25.29).
-In 3,000, for (3, 4), (4, 4.5), (4, 6): drums 25.61, 25.45, 24.94, bricks 27.77, 28.01, 27.94: the ratio rises while
-details are learnt, and hovers between 4 and 6 where the object is large."""
+REMAINING_TO_END, REMAINING_TO_RETURN = 0.5, 0.8
+"""The early phase does not end before R is below the first, and returns when R is above the second (hysteresis)."""
+GAIN_TO_END, GAIN_TO_RETURN = 4.0, 4.5
+"""Nor does it end before E[e] / U[e], the error that edge sampling finds with as many pixels as uniform sampling, is
+below the first; above the second it returns. The ratio rises while details are learnt, so lower thresholds would hold
+on to edges for too long where the object is large, and higher ones would leave small objects too early."""
 WINDOW_STEPS, WINDOW_PIXELS = 16, 256
-"""R forgets after so many steps, or pixels of the object if those take longer; a phase lasts that at least."""
+"""Means are over about so many steps, or so many pixels of the object if those take longer; a phase lasts that at
+least."""
+MAX_PIXELS = 256
+"""Pixels of a step that are looked at, at most twice as many: enough for the means, in a third of a millisecond."""
 
 
-def phase_at(step: int, early_steps: float) -> Phase:
-    """The phase of a step (0, 1, 2, ...): early while step < early_steps."""
-    return "early" if step < early_steps else "late"
+class Schedule(SamplerPart):
+    """Says which phase a step is in."""
+
+    early_may_return: bool = False
+    """Whether the early phase can begin again after the late one."""
+
+    @abstractmethod
+    def phase(self, step: int) -> Phase:
+        """The phase of a step (0, 1, 2, ...)."""
 
 
-class AdaptiveSchedule:
-    """Watches the errors of what is trained on: early while that pays, and again when the object is lost.
+class FixedSchedule(Schedule):
+    """Early while step < early_steps."""
+
+    def __init__(self, early_steps: float) -> None:
+        self.early_steps = early_steps
+
+    def phase(self, step: int) -> Phase:
+        """See `Schedule.phase`."""
+        return "early" if step < self.early_steps else "late"
+
+
+class AdaptiveSchedule(Schedule):
+    """Early while edges pay, and again when they pay again or the object is lost.
 
     It knows no number of steps to come, so that it does the same in a short and in a long run.
+
+    Args:
+        edges: the early distribution.
     """
 
-    def __init__(self) -> None:
-        self.phase: Phase = "early"
+    early_may_return = True
+    needs_errors = True
+
+    def __init__(self, edges: Distribution) -> None:
+        self._edges = edges
+        self._backgrounds = PlainBackgrounds()
+        self.current: Phase = "early"
         self.observations = 0
         self._count = 0.0
         self._begin("early")
 
+    def phase(self, step: int) -> Phase:
+        """The current phase, whatever the step."""
+        return self.current
+
+    def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:
+        """Compare what both ways of drawing would find, from pixels that either of them drew."""
+        rows = slice(None, None, max(1, len(squared_error) // MAX_PIXELS))
+        image, numbers = (values[rows].cpu().numpy() for values in (drawn.values["image"], drawn.values["indices"]))
+        self._backgrounds.add(drawn.batch)
+        distance = self._backgrounds.squared_distance(image, numbers[:, 0], drawn.batch.background_color)
+        edge_ratio = self._edges.density_ratio(drawn.batch, drawn.pixels[rows]).numpy()
+        error = squared_error[rows].float().cpu().numpy()
+        self.observe(*summarize_errors(error, distance, edge_ratio, drawn.density_ratio(rows).numpy()))
+
     def observe(self, count: float, edge_error: float, edge_background: float, uniform_error: float) -> None:
-        """Take note of a step's pixels.
+        """Add a step's means to the running ones, and change the phase if they say so.
 
         Args:
-            count: how many show the object.
+            count: pixels that show the object.
             edge_error: E[e].
             edge_background: E[b].
             uniform_error: U[e].
@@ -63,14 +108,14 @@ class AdaptiveSchedule:
         self._evidence += share * (1 - self._evidence)
         if self._evidence < 1 - math.exp(-1):
             return
-        if self.phase == "early" and self.remaining < LEARNT and self.gain < PAYS_NO_MORE:
+        if self.current == "early" and self.remaining < REMAINING_TO_END and self.gain < GAIN_TO_END:
             self._begin("late")
-        elif self.phase == "late" and (self.remaining > LOST or self.gain > PAYS_AGAIN):
+        elif self.current == "late" and (self.remaining > REMAINING_TO_RETURN or self.gain > GAIN_TO_RETURN):
             self._begin("early")
 
     @property
     def remaining(self) -> float:
-        """R; 1 before anything was seen."""
+        """R; 1 before anything was observed."""
         return self._edge_error / self._edge_background if self._edge_background else 1.0
 
     @property
@@ -79,14 +124,14 @@ class AdaptiveSchedule:
         return self._edge_error / self._uniform_error if self._uniform_error else math.inf
 
     def _begin(self, phase: Phase) -> None:
-        """A phase, judged by its own pixels alone."""
-        self.phase = phase
+        """Begin a phase, which is judged by its own pixels alone."""
+        self.current = phase
         self._edge_error = self._edge_background = self._uniform_error = self._evidence = 0.0
 
-    def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        return dict(vars(self))
+    def state_dict(self) -> dict[str, Any]:
+        """The phase and the running means: plain numbers."""
+        return {name: value for name, value in vars(self).items() if name not in ("_edges", "_backgrounds")}
 
-    def load(self, state: dict[str, Any]) -> None:
-        """Go on where `state` was taken."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from what `state_dict` returned."""
         vars(self).update(state)

@@ -16,8 +16,9 @@ pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio
 
 from full_host import PLANNED, config_of, train, trainer_of, watch  # noqa: E402
 
-from edge_se_sampler.nerfstudio.planned import WATCH_FILE  # noqa: E402
-from edge_se_sampler.nerfstudio.scoring import HOPELESS_AFTER, squared_errors  # noqa: E402
+from edge_se_sampler.nerfstudio.resume import SCHEDULE_FILE  # noqa: E402
+from edge_se_sampler.nerfstudio.scoring import DEAD_CHECK_STEPS, squared_errors  # noqa: E402
+from edge_se_sampler.sampling.background import PlainBackgrounds  # noqa: E402
 from edge_se_sampler.sampling.schedule import WINDOW_STEPS  # noqa: E402
 
 
@@ -28,11 +29,11 @@ def auto(name: str, scene: Path, runs: Path, **changes: Any) -> Any:
 
 
 def observed(trainer: Any) -> list[float]:
-    """The mean error of every observation from now on."""
-    sampler, told = trainer.pipeline.datamanager.train_pixel_sampler, []
+    """The mean of the errors of every training batch that the sampler observes from now on."""
+    sampler, means = trainer.pipeline.datamanager.train_pixel_sampler, []
     observe = sampler.observe
-    sampler.observe = lambda errors: (told.append(float(errors.mean())), observe(errors))[1]
-    return told
+    sampler.observe = lambda errors: (means.append(float(errors.mean())), observe(errors))[1]
+    return means
 
 
 @pytest.mark.parametrize("alpha", ["white", None])
@@ -40,12 +41,13 @@ def observed(trainer: Any) -> list[float]:
 def test_every_training_batch_is_observed_once(name: str, alpha: str | None, host_scene: Path, tmp_path: Path) -> None:
     trainer = trainer_of(auto(name, host_scene, tmp_path, alpha=alpha))
     sampler = trainer.pipeline.datamanager.train_pixel_sampler
-    told = observed(trainer)
+    means = observed(trainer)
     rendered: list[float] = []
 
     def record(module: Any, _: Any, outputs: Any) -> None:
         if module.training and sampler.pending_batch is not None:
-            rendered.append(float(squared_errors(module, outputs, sampler.pending_batch["image"]).detach().mean()))
+            image = sampler.pending_batch.values["image"]
+            rendered.append(float(squared_errors(module, outputs, image).detach().mean()))
 
     hooks = trainer.pipeline.model._forward_hooks
     handle = trainer.pipeline.model.register_forward_hook(record)
@@ -54,13 +56,12 @@ def test_every_training_batch_is_observed_once(name: str, alpha: str | None, hos
     trainer.pipeline.eval()
     trainer.pipeline.get_eval_loss_dict(0)
     trainer.pipeline.train()
-    assert len(told) == 3
-    assert told == rendered
-    sampler.watch.phase = "late"
+    assert len(means) == 3
+    assert means == rendered
+    sampler.schedule.current = "late"
     trainer._start_step = 3
-    train(trainer, 2)  # the candidates tell, and once a step
-    assert len(told) == 5
-    assert sampler.watch.observations == 5
+    train(trainer, 2)  # now scored candidates are observed, once a step
+    assert sampler.schedule.observations == 5
 
 
 def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
@@ -69,8 +70,11 @@ def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
     observe, share = sampler.observe, 1.0
 
     def as_if(errors: torch.Tensor) -> None:
-        image, numbers = sampler.pending_batch["image"].numpy(), sampler.pending_batch["indices"][:, 0].numpy()
-        distance = sampler._backgrounds.squared_distance(image, numbers, sampler.background)
+        pixels = sampler.pending_batch.values
+        image, numbers = pixels["image"].numpy(), pixels["indices"][:, 0].numpy()
+        backgrounds = PlainBackgrounds()
+        backgrounds.add(sampler.pending_batch.batch)
+        distance = backgrounds.squared_distance(image, numbers, sampler.background_color)
         observe(torch.full((len(image),), share * float(distance.mean())))  # alike, so that edges do not pay
 
     sampler.observe = as_if
@@ -83,45 +87,44 @@ def test_the_phase_follows_the_errors(host_scene: Path, tmp_path: Path) -> None:
     assert seen[-1][1] == "se"
 
 
-def test_a_resumed_run_goes_on_watching(host_scene: Path, tmp_path: Path) -> None:
+def test_a_resumed_run_continues_with_the_saved_schedule(host_scene: Path, tmp_path: Path) -> None:
     config = auto("edge-se-nerf", host_scene, tmp_path, max_num_iterations=PLANNED)
     trainer = trainer_of(config)
     trainer.train()
-    saved = trainer.checkpoint_dir.parent / WATCH_FILE
+    saved = trainer.checkpoint_dir.parent / SCHEDULE_FILE
     states = json.loads(saved.read_text())
     assert states[str(PLANNED - 1)]["observations"] == PLANNED
     assert all("step" in path.name for path in trainer.checkpoint_dir.iterdir())  # nothing of ours among them
     again = copy.deepcopy(config)
     again.load_dir, again.timestamp = trainer.checkpoint_dir, "resumed"
     resumed = trainer_of(again)
-    assert resumed.pipeline.datamanager.train_pixel_sampler.watch.state() == states[str(PLANNED - 1)]
+    assert resumed.pipeline.datamanager.train_pixel_sampler.schedule.state_dict() == states[str(PLANNED - 1)]
 
 
-def test_what_no_sampler_can_help_is_told_once(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
+def test_a_dead_model_is_reported_once(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
     trainer = trainer_of(auto("edge-se-nerf", host_scene, tmp_path))
     field = trainer.pipeline.model.field_fine.field_output_density.net
     with torch.no_grad():  # its softplus is never dead, but may be as good as that
         field.weight.zero_()
         field.bias.fill_(-40)
-    trainer.pipeline.datamanager.train_pixel_sampler.watch.observations = HOPELESS_AFTER - 2
+    trainer.pipeline.datamanager.train_pixel_sampler.schedule.observations = DEAD_CHECK_STEPS - 2
     train(trainer, 5)
     assert capfd.readouterr().err.count("nothing of the object is learnt") == 1
 
 
-def test_remembered_errors_are_those_of_training_and_nobody_renders_candidates(
-    host_scene: Path, tmp_path: Path
-) -> None:
+def test_cached_errors_are_those_of_training_and_no_candidate_is_rendered(host_scene: Path, tmp_path: Path) -> None:
     config = config_of("edge-se-nerf", host_scene, tmp_path)
     config.pipeline.datamanager.pixel_sampler.error_source = "cached"
     trainer = trainer_of(config)
     sampler = trainer.pipeline.datamanager.train_pixel_sampler
-    told, seen = observed(trainer), watch(sampler)
+    means, seen = observed(trainer), watch(sampler)
     rendered = []
     trainer.pipeline.model.register_forward_hook(lambda *_: rendered.append(1))
     train(trainer, 8)
     assert {strategy for _, strategy, _ in seen} == {"edge", "se"}
-    assert len(told) == len(rendered) == 8  # one rendering a step, of what is trained on
-    assert sampler.memory.seen.max() == 8
-    values = sampler.memory.values[sampler.memory.seen > 0]
+    assert len(means) == len(rendered) == 8  # one rendering a step, of what is trained on
+    error_map = sampler.strategies["se"].selector.error_map
+    assert error_map.updated.max() == 8
+    values = error_map.values[error_map.updated > 0]
     assert float(values.min()) >= 0
     assert values.std() > 0

@@ -112,7 +112,7 @@ def test_only_some_images_in_memory_train_as_well(host_scene: Path, tmp_path: Pa
         trainer.train_iteration(0)
     assert {number for *_, indices in seen for number in indices[:, 0].tolist()} == {0, 1, 2, 3}
     assert all(len(indices[:, 0].unique()) <= 2 for *_, indices in seen)
-    assert len(sampler._tables["edge"].place) == 4
+    assert len(sampler.strategies["edge"].distribution._table) == 4
 
 
 def test_all_pixels_masked_is_refused_before_training(host_scene: Path, tmp_path: Path) -> None:

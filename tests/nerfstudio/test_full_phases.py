@@ -19,7 +19,7 @@ from full_host import PLANNED, RAYS, config_of, train, trainer_of, watch  # noqa
 from nerfstudio.data.pixel_samplers import PixelSampler  # noqa: E402
 
 from edge_se_sampler.errors import InputError  # noqa: E402
-from edge_se_sampler.nerfstudio.planned import FILE  # noqa: E402
+from edge_se_sampler.nerfstudio.resume import PLAN_FILE  # noqa: E402
 
 
 def test_the_host_is_nerfstudio_itself() -> None:
@@ -87,11 +87,11 @@ def test_a_checkpoint_without_a_plan_is_told(host_scene: Path, tmp_path: Path, c
     config = config_of("edge-se-nerf", host_scene, tmp_path)
     trainer = trainer_of(config)
     train(trainer, 1)
-    (trainer.base_dir / FILE).unlink()
+    (trainer.base_dir / PLAN_FILE).unlink()
     capfd.readouterr()
     again = resumed(config, trainer, max_num_iterations=400)
     assert again.pipeline.datamanager.train_pixel_sampler._early_steps == 40
-    assert f"no plan at {trainer.base_dir / FILE}" in capfd.readouterr().err
+    assert f"no plan at {trainer.base_dir / PLAN_FILE}" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"planned_steps": "20"}', '{"planned_steps": 0}'])
@@ -99,8 +99,8 @@ def test_what_is_no_plan_is_refused(content: str, host_scene: Path, tmp_path: Pa
     config = config_of("edge-se-nerf", host_scene, tmp_path)
     trainer = trainer_of(config)
     train(trainer, 1)
-    (trainer.base_dir / FILE).write_text(content)
-    with pytest.raises(InputError, match=f"{FILE}: .*delete it to plan anew"):
+    (trainer.base_dir / PLAN_FILE).write_text(content)
+    with pytest.raises(InputError, match=f"{PLAN_FILE}: .*delete it to follow"):
         resumed(config, trainer)
 
 
@@ -112,7 +112,7 @@ def test_the_state_is_nerfstudios_alone(host_scene: Path, tmp_path: Path) -> Non
     (checkpoint,) = trainer.checkpoint_dir.glob("*.ckpt")
     saved = torch.load(checkpoint, weights_only=False)
     assert set(saved["pipeline"]) == set(stock.pipeline.state_dict())
-    assert json.loads((trainer.base_dir / FILE).read_text()) == {"planned_steps": PLANNED}
+    assert json.loads((trainer.base_dir / PLAN_FILE).read_text()) == {"planned_steps": PLANNED}
     manager = trainer.pipeline.datamanager
     if isinstance(manager, torch.nn.Module):  # as in 1.1.5, no longer in its main branch
         held = {type(module).__name__ for module in manager.modules()}

@@ -144,7 +144,7 @@ def test_edges_are_taken_in_front_of_the_models_background(
 ) -> None:
     config = config_of("edge-se-nerfacto", host_scene, tmp_path, alpha=None)
     config.pipeline.model.background_color = background
-    assert trainer_of(config).pipeline.datamanager.train_pixel_sampler.background == shade
+    assert trainer_of(config).pipeline.datamanager.train_pixel_sampler.background_color == shade
 
 
 def test_a_model_without_colours_is_refused() -> None:

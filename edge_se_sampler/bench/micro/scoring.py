@@ -21,6 +21,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.sampling.strategies import RankedError
 
 ERROR_SOURCES = ("fine", "coarse", "cached")
 NUM_RANKED = 4096
@@ -78,6 +79,9 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
     """
     manager, model = trainer.pipeline.datamanager, trainer.pipeline.model
     sampler, images = manager.train_pixel_sampler, manager.image_batch["image"]
+    ranked = sampler.strategies["se"].selector
+    assert isinstance(ranked, RankedError)
+    assert ranked.error_map is not None
     rng = np.random.default_rng(0)
     numbers = rng.integers(len(images), size=NUM_RANKED)
     pixels = [(n, *rng.integers(images[n].shape[:2])) for n in numbers.tolist()]
@@ -92,5 +96,5 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
             for level, of_level in errors.items():
                 of_level.append(model.squared_error(outputs, image[rows], level))
     fine, coarse = (torch.cat(of_level).numpy() for of_level in errors.values())
-    cached = sampler.memory.recall(indices.numpy(), step, sampler.num_rays_per_batch)
+    cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)
     return {"coarse": rank_correlation(fine, coarse), "cached": rank_correlation(fine, cached)}

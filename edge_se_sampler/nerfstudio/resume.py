@@ -1,0 +1,100 @@
+"""What a resumed nerfstudio run needs for its phases, kept in files beside the run's checkpoint folder: the number of
+iterations that the first run was planned for, and the state of an adaptive schedule.
+
+nerfstudio 1.1.5 resumes for max_num_iterations *more* steps, in another folder, and its checkpoints are its own. The
+files must not lie among them: nerfstudio reads the name of every file there as that of a step.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from edge_se_sampler.engine.files import write_json
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule
+
+PLAN_FILE = "edge-se-plan.json"
+SCHEDULE_FILE = "edge-se-schedule.json"
+
+
+def planned_steps(trainer: Any) -> int:
+    """Iterations that the run was first planned for; also written beside this run's checkpoints, for the next to find.
+
+    Args:
+        trainer: nerfstudio's, once it has loaded its checkpoint, if there is one.
+
+    Raises:
+        InputError: the file beside the loaded checkpoint's folder is no plan, or this run's cannot be written.
+    """
+    steps = trainer.config.max_num_iterations
+    loaded = _loaded_run(trainer)
+    if loaded:
+        plan = loaded / PLAN_FILE
+        if plan.exists():
+            steps = _read_plan(plan)
+        else:
+            print(
+                f"edge-se-sampler: no plan at {plan}: the phases follow this run's max-num-iterations, {steps}",
+                file=sys.stderr,
+            )
+    if trainer.local_rank == 0:
+        plan = trainer.checkpoint_dir.parent / PLAN_FILE
+        plan.parent.mkdir(parents=True, exist_ok=True)
+        write_json(plan, {"planned_steps": steps})
+    return steps
+
+
+def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
+    """Load the state that the schedule had at the loaded checkpoint, if there is one.
+
+    Raises:
+        InputError: the file beside the loaded checkpoint's folder holds no such state.
+    """
+    loaded = _loaded_run(trainer)
+    if not loaded or not (loaded / SCHEDULE_FILE).exists():
+        return
+    path = loaded / SCHEDULE_FILE
+    try:
+        state = json.loads(path.read_text()).get(str(trainer._start_step - 1))
+        if state is not None:
+            schedule.load_state_dict(state)
+    except (OSError, ValueError, AttributeError, TypeError) as problem:
+        raise InputError(f"{path}: cannot be read ({problem!r}); delete it to begin with the early phase") from problem
+
+
+def schedule_writer(trainer: Any, schedule: AdaptiveSchedule) -> Callable[..., None]:
+    """A function to be called with each step after training it: writes the schedule's state whenever nerfstudio saves a
+    checkpoint. It raises InputError where it cannot write."""
+    config, start = trainer.config, trainer._start_step
+    path, states = trainer.checkpoint_dir.parent / SCHEDULE_FILE, {}
+    last = {config.max_num_iterations - 1, start + config.max_num_iterations - 1}  # of nerfstudio's main, of 1.1.5
+
+    def write_schedule(step: int) -> None:
+        if trainer.local_rank == 0 and (step % config.steps_per_save == 0 or step in last):
+            states[str(step)] = schedule.state_dict()
+            write_json(path, states)
+
+    return write_schedule
+
+
+def _loaded_run(trainer: Any) -> Path | None:
+    """The folder of the run that the loaded checkpoint is from."""
+    config = trainer.config
+    loaded = config.load_dir or (config.load_checkpoint and config.load_checkpoint.parent)
+    return loaded.resolve().parent if loaded else None
+
+
+def _read_plan(path: Path) -> int:
+    try:
+        steps = json.loads(path.read_text())["planned_steps"]
+    except (OSError, ValueError, KeyError, TypeError) as problem:
+        raise InputError(f"{path}: cannot be read ({problem!r}); delete it to follow max-num-iterations") from problem
+    if type(steps) is not int or steps < 1:
+        raise InputError(
+            f"{path}: planned_steps is {steps!r}, not a number of steps; delete it to follow max-num-iterations"
+        )
+    return steps
