@@ -24,9 +24,9 @@ def pixels(seed: int, width: int = WIDTH, height: int = HEIGHT, channels: int = 
 def pose(seed: int) -> list[list[float]]:
     """A random rigid 4x4 matrix."""
     rng = np.random.default_rng(seed)
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     matrix = np.eye(4)
-    matrix[:3, :3] = turn * np.sign(np.linalg.det(turn))
+    matrix[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
     matrix[:3, 3] = rng.normal(size=3)
     return matrix.tolist()
 

@@ -15,15 +15,15 @@ from edge_se_sampler.data.synthetic import make_scenes
 
 
 @pytest.fixture(scope="session")
-def _made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
+def _rendered_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("synthetic")
     return make_scenes(folder, ["mic"], size=24, num_train=3, num_val=1, num_test=1)[0]
 
 
 @pytest.fixture
-def scene(_made_once: Path, tmp_path: Path) -> Path:
+def scene(_rendered_scene: Path, tmp_path: Path) -> Path:
     """A Blender folder of its own: 3 training views, 1 val, 1 test, 24 x 24."""
-    return Path(shutil.copytree(_made_once, tmp_path / "scene"))
+    return Path(shutil.copytree(_rendered_scene, tmp_path / "scene"))
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def test_pixels_names_and_poses_are_those_on_disk(tmp_path: Path, doc: dict[str,
     np.testing.assert_array_equal(views.cameras.camera_to_worlds, expected)  # every bit of the doubles
 
 
-def test_camera_from_the_angle(tmp_path: Path, doc: dict[str, Any]) -> None:
+def test_focal_length_from_the_angle_of_view(tmp_path: Path, doc: dict[str, Any]) -> None:
     views = read_blender(tmp_path, "train")
     assert focal_lengths(views).shape == principal_points(views).shape == (3, 2)
     assert focal_lengths(views).dtype == principal_points(views).dtype == np.float64
@@ -61,7 +61,9 @@ def test_the_known_focal_of_nerf_synthetic(tmp_path: Path, doc: dict[str, Any]) 
     np.testing.assert_allclose(focal_lengths(read_blender(tmp_path, "train")), 1111.1110311937682, rtol=1e-12)
 
 
-def test_lengths_in_pixels_override_the_angle_and_a_frame_its_file(tmp_path: Path, doc: dict[str, Any]) -> None:
+def test_focal_lengths_in_pixels_override_the_angle_and_a_frame_overrides_the_file(
+    tmp_path: Path, doc: dict[str, Any]
+) -> None:
     doc |= {"fl_x": 10, "fl_y": 11.5, "cx": 2.5, "cy": -1}
     doc["frames"][1] |= {"fl_x": 20.25, "cy": 1.75}
     write_json(tmp_path, doc)
@@ -70,7 +72,7 @@ def test_lengths_in_pixels_override_the_angle_and_a_frame_its_file(tmp_path: Pat
     np.testing.assert_array_equal(principal_points(views), [[2.5, -1], [2.5, 1.75], [2.5, -1]])
 
 
-def test_the_angle_may_be_missing_beside_fl_x_and_pixels_are_square(tmp_path: Path, doc: dict[str, Any]) -> None:
+def test_the_angle_is_optional_if_every_frame_has_fl_x(tmp_path: Path, doc: dict[str, Any]) -> None:
     del doc["camera_angle_x"]
     for i, frame in enumerate(doc["frames"]):
         frame["fl_x"] = i + 1
@@ -117,7 +119,7 @@ def one_view(folder: Path, data: bytes) -> np.ndarray:
 
 PALETTE = chunk(b"PLTE", bytes([10, 20, 30, 40, 50, 60]))  # colors 0 and 1
 RGB_ROW = b"\0\1\2\3\4\5\6"  # the filter, then two pixels
-TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
+TWO_COLORS = [[[10, 20, 30], [40, 50, 60]]]
 
 
 @pytest.mark.parametrize(
@@ -126,8 +128,8 @@ TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
         pytest.param(png(2, 1, 8, 0, b"\0\x07\xff"), [[[7] * 3, [255] * 3]], id="gray"),
         pytest.param(png(2, 1, 1, 0, b"\0\x40"), [[[0] * 3, [255] * 3]], id="one bit"),
         pytest.param(png(2, 1, 8, 4, b"\0\x07\x08\x09\x0a"), [[[7, 7, 7, 8], [9, 9, 9, 10]]], id="gray and alpha"),
-        pytest.param(png(2, 1, 8, 3, b"\0\0\1", PALETTE), TWO_COLOURS, id="palette"),
-        pytest.param(png(2, 1, 1, 3, b"\0\x40", PALETTE), TWO_COLOURS, id="palette of one bit"),
+        pytest.param(png(2, 1, 8, 3, b"\0\0\1", PALETTE), TWO_COLORS, id="palette"),
+        pytest.param(png(2, 1, 1, 3, b"\0\x40", PALETTE), TWO_COLORS, id="palette of one bit"),
         pytest.param(
             png(2, 1, 8, 3, b"\0\0\1", PALETTE + chunk(b"tRNS", b"\x80")),
             [[[10, 20, 30, 128], [40, 50, 60, 255]]],
@@ -142,7 +144,7 @@ TWO_COLOURS = [[[10, 20, 30], [40, 50, 60]]]
         pytest.param(png(2, 1, 8, 2, RGB_ROW) + b"more", [[[1, 2, 3], [4, 5, 6]]], id="bytes after the end"),
     ],
 )
-def test_kinds_of_png(tmp_path: Path, data: bytes, expected: list[list[list[int]]]) -> None:
+def test_pixels_of_every_kind_of_png(tmp_path: Path, data: bytes, expected: list[list[list[int]]]) -> None:
     image = one_view(tmp_path, data)
     assert image.dtype == np.uint8
     np.testing.assert_array_equal(image, expected)
@@ -178,7 +180,7 @@ def test_a_hundred_views_keep_the_order_of_the_json(tmp_path: Path) -> None:
         np.testing.assert_array_equal(matrix, pose(i)[:3])
 
 
-def test_what_no_frame_lists_is_not_looked_at(tmp_path: Path) -> None:
+def test_files_that_no_frame_lists_are_ignored(tmp_path: Path) -> None:
     doc = write_scene(tmp_path, split="test")
     (tmp_path / "test/r_0_depth_0001.png").write_bytes(b"no image")
     (tmp_path / "test/r_0_normal_0001.png").mkdir()
@@ -188,10 +190,10 @@ def test_what_no_frame_lists_is_not_looked_at(tmp_path: Path) -> None:
     assert len(read_blender(tmp_path, "test").images) == 3
 
 
-@pytest.mark.parametrize("place", ["file", "frame"])
-def test_lens_distortion_is_refused_unless_it_is_none(place: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("level", ["file", "frame"])
+def test_lens_distortion_is_refused_unless_it_is_zero(level: str, tmp_path: Path) -> None:
     doc = write_scene(tmp_path, split="test")
-    parent = doc if place == "file" else doc["frames"][1]
+    parent = doc if level == "file" else doc["frames"][1]
     parent |= {"k1": 0, "p2": 0.0}
     write_json(tmp_path, doc, "test")
     assert len(read_blender(tmp_path, "test").images) == 3
@@ -201,7 +203,7 @@ def test_lens_distortion_is_refused_unless_it_is_none(place: str, tmp_path: Path
         read_blender(tmp_path, "test")
 
 
-def test_poses_as_rounded_in_files_are_kept_as_written(tmp_path: Path, doc: dict[str, Any]) -> None:
+def test_rounded_poses_are_kept_as_written(tmp_path: Path, doc: dict[str, Any]) -> None:
     for frame in doc["frames"]:
         frame["transform_matrix"] = np.round(frame["transform_matrix"], 4).tolist()
     write_json(tmp_path, doc)
@@ -209,7 +211,7 @@ def test_poses_as_rounded_in_files_are_kept_as_written(tmp_path: Path, doc: dict
     np.testing.assert_array_equal(read_blender(tmp_path, "train").cameras.camera_to_worlds, expected)
 
 
-def test_links_that_stay_inside_and_a_folder_behind_a_link(tmp_path: Path) -> None:
+def test_links_inside_the_folder_and_to_the_folder_are_followed(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     doc = write_scene(scene)
     os.symlink("r_0.png", scene / "train/link.png")

@@ -33,8 +33,8 @@ def refusal(folder: Path, split: Literal["train", "val", "test"] = "train") -> s
     message = str(caught.value)
     assert message.isprintable(), "one line, nothing unescaped"
     assert len(message) < 800
-    place, problem, hint = re.fullmatch(r"(.*?): (.*?); (.*)", message).groups()  # type: ignore[union-attr]
-    assert all(len(part) > 5 for part in (place, problem, hint))
+    location, problem, hint = re.fullmatch(r"(.*?): (.*?); (.*)", message).groups()  # type: ignore[union-attr]
+    assert all(len(part) > 5 for part in (location, problem, hint))
     return message
 
 
@@ -239,7 +239,9 @@ def test_a_bad_image_or_mask(tmp_path: Path, doc: Doc, key: str, data: bytes, sa
         pytest.param(lambda path: os.symlink("../outside.png", path), "leads out", id="a link out"),
     ],
 )
-def test_no_image_file(tmp_path: Path, doc: Doc, key: str, make: Callable[[Path], None], says: str) -> None:
+def test_a_path_that_is_no_regular_file(
+    tmp_path: Path, doc: Doc, key: str, make: Callable[[Path], None], says: str
+) -> None:
     make(tmp_path / "scene/bad.png")
     doc["frames"][2][key] = "bad.png"
     write_json(tmp_path / "scene", doc)
@@ -248,7 +250,7 @@ def test_no_image_file(tmp_path: Path, doc: Doc, key: str, make: Callable[[Path]
     assert re.search(says, message)
 
 
-def test_a_folder_beside_with_the_same_start_is_outside(tmp_path: Path, doc: Doc) -> None:
+def test_a_sibling_folder_whose_name_begins_alike_is_outside(tmp_path: Path, doc: Doc) -> None:
     write_scene(tmp_path / "scene2")
     doc["frames"][1]["file_path"] = "../scene2/train/r_1"
     write_json(tmp_path / "scene", doc)
@@ -262,7 +264,7 @@ def test_two_frames_of_one_image_through_a_link(tmp_path: Path, doc: Doc) -> Non
     assert re.search(r"frames\[2\]\.file_path: .*already the image of frames\[0\]", refusal(tmp_path / "scene"))
 
 
-def test_everything_masked(tmp_path: Path, doc: Doc) -> None:
+def test_masks_that_hide_every_pixel(tmp_path: Path, doc: Doc) -> None:
     iio.imwrite(tmp_path / "scene/mask.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     for frame in doc["frames"]:
         frame["mask_path"] = "mask.png"
@@ -271,7 +273,9 @@ def test_everything_masked(tmp_path: Path, doc: Doc) -> None:
 
 
 @pytest.mark.parametrize("name", [JSON, "train/r_1.png"])
-def test_a_file_without_permission(tmp_path: Path, doc: Doc, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_may_not_be_read_is_reported_even_to_root(
+    tmp_path: Path, doc: Doc, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Refused by a stand-in for the system: root, as which tests may run, may read everything."""
     read = Path.read_bytes
 
@@ -287,7 +291,7 @@ def test_a_file_without_permission(tmp_path: Path, doc: Doc, name: str, monkeypa
 
 
 @pytest.mark.parametrize("name", [".", JSON, "train/r_1.png"])
-def test_permissions_taken_away(tmp_path: Path, doc: Doc, name: str) -> None:
+def test_a_file_or_folder_that_may_not_be_read(tmp_path: Path, doc: Doc, name: str) -> None:
     path = tmp_path / "scene" / name
     mode = path.stat().st_mode
     path.chmod(0)

@@ -17,11 +17,11 @@ def test_poses_are_rigid_and_upright() -> None:
     poses = spiral(LIKE, 17).camera_to_worlds.double().numpy()
     assert poses.shape == (17, 3, 4)
     for pose in poses:
-        turn = pose[:, :3]
-        np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-6)
-        assert np.linalg.det(turn) > 0
-        assert abs(turn[2, 0]) < 1e-6  # right is level
-        assert turn[2, 1] > 0  # up is up
+        rotation = pose[:, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-6)
+        assert np.linalg.det(rotation) > 0
+        assert abs(rotation[2, 0]) < 1e-6  # right is level
+        assert rotation[2, 1] > 0  # up is up
 
 
 def test_every_view_looks_at_the_origin_from_the_median_distance() -> None:
@@ -33,7 +33,7 @@ def test_every_view_looks_at_the_origin_from_the_median_distance() -> None:
     np.testing.assert_allclose(rays.origins + 4 * rays.directions, np.zeros((12, 3)), atol=1e-5)
 
 
-def test_it_is_one_even_turn_between_15_and_45_degrees() -> None:
+def test_azimuth_grows_evenly_and_elevation_stays_between_15_and_45_degrees() -> None:
     eyes = spiral(LIKE, 360).camera_to_worlds[:, :, 3].double().numpy()
     azimuth = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
     np.testing.assert_allclose(np.diff(azimuth), 2 * np.pi / 360, atol=1e-5)
@@ -41,7 +41,7 @@ def test_it_is_one_even_turn_between_15_and_45_degrees() -> None:
     np.testing.assert_allclose((elevation.min(), elevation.max()), (15, 45), atol=0.01)
 
 
-def test_the_intrinsics_and_size_are_the_first_cameras() -> None:
+def test_intrinsics_and_size_are_the_first_cameras() -> None:
     cameras = spiral(LIKE, 5)
     assert len(cameras) == 5
     for key in ("fx", "fy", "cx", "cy", "width", "height"):

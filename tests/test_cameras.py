@@ -1,4 +1,4 @@
-"""Pixels become rays: against a pinhole camera written down a second time, and against the synthetic scenes."""
+"""Pixels become rays: against a second pinhole camera written in numpy, and against the synthetic scenes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def some_cameras(seed: int = 0) -> Cameras:
     rng = np.random.default_rng(seed)
     poses = []
     for _ in SIZES:
-        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        turn *= np.sign(np.linalg.det(turn))
-        poses.append(np.concatenate((turn, rng.normal(size=(3, 1))), axis=1))
+        rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        rotation *= np.sign(np.linalg.det(rotation))
+        poses.append(np.concatenate((rotation, rng.normal(size=(3, 1))), axis=1))
     return Cameras(
         camera_to_worlds=torch.tensor(np.array(poses)),
         fx=torch.tensor([[9.0], [7.5], [20.0]]).double(),
@@ -50,7 +50,7 @@ def along(rays: RayBundle, distance: float) -> np.ndarray:
     return (rays.origins + distance * rays.directions).double().numpy()
 
 
-def test_what_lies_on_a_pixels_ray_projects_to_its_centre() -> None:
+def test_points_on_a_pixels_ray_project_to_its_center() -> None:
     cameras = some_cameras()
     for camera, (rows, columns) in enumerate(SIZES):
         for row in range(rows):
@@ -74,7 +74,7 @@ def test_the_ray_of_a_projected_point_passes_through_it() -> None:
         np.testing.assert_allclose(rays.origins + torch.tensor(distance) * rays.directions, points, atol=1e-9)
 
 
-def test_directions_are_of_unit_length_and_their_norm_tells_depth() -> None:
+def test_directions_norm_turns_depth_into_distance_along_the_ray() -> None:
     """A sample at distance depth * directions_norm lies at that depth: near and far are planes, not spheres."""
     cameras = some_cameras()
     for camera in range(3):
@@ -108,7 +108,7 @@ def test_indexing_keeps_every_field_and_the_order() -> None:
             torch.testing.assert_close(getattr(chosen, key), values[[2, 0]])
 
 
-def test_cameras_of_matrices_share_plain_numbers() -> None:
+def test_intrinsics_are_given_for_each_camera_or_as_one_number_for_all() -> None:
     poses = np.random.default_rng(0).normal(size=(3, 4, 4))
     cameras = Cameras.of(poses, fx=[10, 12, 14], fy=11, cx=2.5, cy=(1, 2, 3), width=6, height=[4, 5, 6])
     np.testing.assert_array_equal(cameras.camera_to_worlds, poses[:, :3])
@@ -118,7 +118,7 @@ def test_cameras_of_matrices_share_plain_numbers() -> None:
     assert (cameras.fx.dtype, cameras.width.dtype) == (torch.float64, torch.int64)
 
 
-def test_conversion_leaves_sizes_whole() -> None:
+def test_conversion_leaves_sizes_integers() -> None:
     cameras = some_cameras().to("cpu", torch.float32)
     assert {value.dtype for value in vars(cameras).values()} == {torch.float32, torch.int64}
 
@@ -148,7 +148,7 @@ def test_a_slice_of_rays_is_those_rays() -> None:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same three views: centred at 24 x 24, and with the object 8 right of and 4 above the middle of 40 x 40."""
+    """The same three views: centered at 24 x 24, and with the object 8 right of and 4 above the middle of 40 x 40."""
     out = tmp_path_factory.mktemp("placed")
     counts: Any = {"num_train": 3, "num_val": 0, "num_test": 0}
     return {
@@ -158,14 +158,14 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
-def test_a_shifted_scene_has_the_rays_of_the_centred_one(folders: dict[str, Path]) -> None:
-    """Pixels pasted (12, 4) right and up of the corner: same colors, same rays, so nothing but the place differs."""
-    centred, shifted = (read_blender(folders[name], "train") for name in ("centered", "shifted"))
+def test_a_shifted_scene_has_the_rays_of_the_centered_one(folders: dict[str, Path]) -> None:
+    """Its 24 x 24 pixels stand elsewhere on the larger image, with the same colors and rays."""
+    centered, shifted = (read_blender(folders[name], "train") for name in ("centered", "shifted"))
     top, left = 20 - 12 - 4, 20 - 12 + 8
     for view in range(3):
         pasted = shifted.images[view][top : top + 24, left : left + 24]
-        np.testing.assert_array_equal(pasted, centred.images[view])
-        small = centred.cameras.image_rays(view)
+        np.testing.assert_array_equal(pasted, centered.images[view])
+        small = centered.cameras.image_rays(view)
         large = shifted.cameras.image_rays(view)
         for name in ("origins", "directions"):
             inside = getattr(large, name).reshape(40, 40, 3)[top : top + 24, left : left + 24]
@@ -173,8 +173,8 @@ def test_a_shifted_scene_has_the_rays_of_the_centred_one(folders: dict[str, Path
 
 
 @pytest.mark.parametrize("placement", ["centered", "shifted", "rotated"])
-def test_rays_meet_the_scene_where_its_pictures_show_it(folders: dict[str, Path], placement: str) -> None:
-    """A pixel's alpha is the share of 16 rays that hit; the ray of its center must agree where all or none do."""
+def test_rays_hit_the_scene_where_its_pictures_show_it(folders: dict[str, Path], placement: str) -> None:
+    """A pixel's alpha is the fraction of 16 rays that hit; the ray of its center must agree where all or none do."""
     views = read_blender(folders[placement], "train")
     scene = synthetic_scene("bricks")
     for view in range(3):

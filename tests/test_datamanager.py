@@ -1,4 +1,4 @@
-"""The data manager: images as a host's loaders hand them on, and the rays and pixels of a training step."""
+"""The data manager: images in nerfstudio's format, and the rays and pixels of a training step."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def manager_of(views: Any = VIEWS, rays: int = 50, **settings: Any) -> VanillaDa
     return config.setup(views=views)
 
 
-def follow(manager: VanillaDataManager, step: int) -> None:
-    """Let the sampler believe that a run of 100 steps has come to this one."""
+def bind_at_step(manager: VanillaDataManager, step: int) -> None:
+    """Bind the sampler to a run of 100 steps that is at this step."""
     manager.train_pixel_sampler.bind(
         squared_error=lambda batch: torch.arange(len(batch["indices"])).float(), planned_steps=100, seed=0
     )
@@ -46,7 +46,7 @@ def test_views_of_one_size_are_stacked() -> None:
     np.testing.assert_array_equal(batch["image"], np.stack(VIEWS.images))
 
 
-def test_views_of_many_sizes_are_a_list() -> None:
+def test_views_of_different_sizes_are_a_list() -> None:
     masks = (np.ones((8, 6), bool), np.zeros((4, 5), bool))
     views = replace(VIEWS, images=(VIEWS.images[0], VIEWS.images[1][:4, :5]), masks=masks)
     batch = image_batch(views)
@@ -55,20 +55,20 @@ def test_views_of_many_sizes_are_a_list() -> None:
     assert batch["image_idx"].tolist() == [0, 1]
 
 
-def test_masks_go_with_their_images() -> None:
+def test_masks_are_stacked_like_their_images() -> None:
     masks = tuple(np.random.default_rng(i).random((8, 6)) < 0.5 for i in range(3))
     batch = image_batch(replace(VIEWS, masks=masks))
     assert batch["mask"].dtype == torch.bool
     np.testing.assert_array_equal(batch["mask"][..., 0], np.stack(masks))
 
 
-def test_an_opaque_image_among_transparent_ones_gets_full_alpha() -> None:
+def test_an_rgb_image_among_rgba_ones_gets_opaque_alpha() -> None:
     rgb = VIEWS.images[1][..., :3]
     batch = image_batch(replace(VIEWS, images=(VIEWS.images[0], rgb, VIEWS.images[2])))
     np.testing.assert_array_equal(batch["image"][1, ..., :3], rgb)
     assert bool((batch["image"][1, ..., 3] == 255).all())
     np.testing.assert_array_equal(batch["image"][0], VIEWS.images[0])
-    assert image_batch(tiny_views(2, channels=3))["image"].shape[3] == 3  # nobody has alpha: none is made up
+    assert image_batch(tiny_views(2, channels=3))["image"].shape[3] == 3  # none has alpha, so none is added
 
 
 def test_no_views_are_refused() -> None:
@@ -76,7 +76,7 @@ def test_no_views_are_refused() -> None:
         image_batch(replace(VIEWS, images=()))
 
 
-def test_eight_bits_become_the_unit_interval_and_floats_stay() -> None:
+def test_uint8_is_scaled_to_the_unit_interval_and_floats_are_kept() -> None:
     assert unit_interval(torch.tensor([0, 51, 255], dtype=torch.uint8)).tolist() == pytest.approx([0, 0.2, 1])
     assert unit_interval(torch.tensor([255], dtype=torch.uint8)).tolist() == [1.0]
     floats = torch.tensor([0.25, 1.0])
@@ -91,7 +91,7 @@ def test_eight_bits_become_the_unit_interval_and_floats_stay() -> None:
 def test_rays_and_pixels_of_a_step_belong_together(step: int, images_per_step: Any) -> None:
     """In the early (edge) and the late (squared error) phase."""
     manager = manager_of(images_per_step=images_per_step)
-    follow(manager, step)
+    bind_at_step(manager, step)
     rays, batch = manager.next_train(step)
     assert len(rays) == len(batch["indices"]) == len(batch["image"]) == 50
     for i, (view, row, column) in enumerate(batch["indices"].tolist()):
@@ -106,12 +106,12 @@ def test_masked_pixels_are_not_trained_on() -> None:
     masks = tuple(np.eye(8, 6, dtype=bool) for _ in range(3))
     manager = manager_of(replace(VIEWS, masks=masks))
     for step in (0, 50):
-        follow(manager, step)
+        bind_at_step(manager, step)
         _, batch = manager.next_train(step)
         assert bool((batch["indices"][:, 1] == batch["indices"][:, 2]).all())
 
 
-def test_configs_are_not_written_into() -> None:
+def test_configs_are_not_changed() -> None:
     sampler = EdgeSEPixelSamplerConfig()
     config = VanillaDataManagerConfig(train_num_rays_per_batch=50, pixel_sampler=sampler)
     before = copy.deepcopy(config)
@@ -123,7 +123,7 @@ def test_configs_are_not_written_into() -> None:
 
 @dataclass
 class CornerConfig(PixelSamplerConfig):
-    """Of somebody else's sampler, which writes into its config as nerfstudio's do."""
+    """The config of a third-party sampler that writes into its config, as nerfstudio's do."""
 
     _target: ClassVar[Any] = field(default=None)
 
@@ -141,7 +141,7 @@ class CornerSampler(PixelSampler):
 CornerConfig._target = CornerSampler
 
 
-def test_any_samplers_config_may_stand_in() -> None:
+def test_any_pixel_sampler_with_nerfstudios_contract_is_accepted() -> None:
     sampler = CornerConfig(num_rays_per_batch=3)
     manager = VanillaDataManagerConfig(train_num_rays_per_batch=5, pixel_sampler=sampler).setup(views=VIEWS)
     rays, batch = manager.next_train(0)
@@ -150,15 +150,15 @@ def test_any_samplers_config_may_stand_in() -> None:
     assert sampler.num_rays_per_batch == 3
 
 
-def test_rays_err_as_the_model_errs() -> None:
+def test_ray_errors_are_the_models_squared_errors() -> None:
     """By the fine colours, against pixels composited on the background."""
     manager, model = manager_of(rays=21), tiny_model().float().eval()
-    follow(manager, 0)
+    bind_at_step(manager, 0)
     rays, batch = manager.next_train(0)
     with torch.no_grad():
-        errors, shown = manager.ray_errors(model, rays, batch), model(rays)["rgb_fine"]
+        errors, rendered = manager.ray_errors(model, rays, batch), model(rays)["rgb_fine"]
     color, alpha = batch["image"][:, :3], batch["image"][:, 3:]
-    expected = ((shown - (color * alpha + 1 - alpha)) ** 2).sum(dim=1)
+    expected = ((rendered - (color * alpha + 1 - alpha)) ** 2).sum(dim=1)
     torch.testing.assert_close(errors, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -167,7 +167,7 @@ def test_everything_that_the_loss_needs_is_on_the_device() -> None:
     sampler = EdgeSEPixelSamplerConfig(importance_weight=1.0)
     config = VanillaDataManagerConfig(train_num_rays_per_batch=50, pixel_sampler=sampler)
     manager = config.setup(views=VIEWS, device="meta")
-    follow(manager, 0)
+    bind_at_step(manager, 0)
     rays, batch = manager.next_train(0)
     assert rays.directions.device.type == batch["image"].device.type == "meta"
     assert batch["weight"].device.type == "meta"

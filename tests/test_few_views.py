@@ -15,7 +15,7 @@ from edge_se_sampler.engine.session import chosen_views, read_views
 from edge_se_sampler.errors import InputError
 
 
-def test_the_views_are_those_that_infonerfs_code_picks() -> None:
+def test_num_views_picks_the_views_of_infonerfs_code() -> None:
     """From its own run: numpy.random.RandomState(0).permutation(100)[:10]."""
     assert chosen_views(TrainerConfig(num_views=10), 100) == [26, 86, 2, 55, 75, 93, 16, 73, 54, 95]
     assert chosen_views(TrainerConfig(num_views=4), 100) == [26, 86, 2, 55]
@@ -24,7 +24,7 @@ def test_the_views_are_those_that_infonerfs_code_picks() -> None:
     assert chosen_views(TrainerConfig(views=(5, 0, 3)), 7) == [5, 0, 3]
 
 
-def test_a_subset_keeps_everything_of_its_views() -> None:
+def test_a_subset_keeps_every_field() -> None:
     views = replace(tiny_views(4, 8, 6), masks=tuple(np.full((8, 6), i > 1) for i in range(4)))
     few = views.subset([3, 1])
     assert few.names == (views.names[3], views.names[1])
@@ -35,7 +35,7 @@ def test_a_subset_keeps_everything_of_its_views() -> None:
         np.testing.assert_array_equal(getattr(few.cameras, key), values[[3, 1]])
 
 
-def test_the_data_of_a_run_is_only_what_was_chosen(scene: Path) -> None:
+def test_a_run_reads_only_the_chosen_views(scene: Path) -> None:
     everything = read_views(TrainerConfig(data=scene))
     few = read_views(TrainerConfig(data=scene, views=(2,)))
     assert few.names == everything.names[2:]
@@ -54,6 +54,6 @@ def test_the_data_of_a_run_is_only_what_was_chosen(scene: Path) -> None:
         ({"views": (-1,)}, "numbered 0 to 2"),
     ],
 )
-def test_choices_that_cannot_be_are_refused(choice: dict[str, Any], message: str, scene: Path) -> None:
+def test_invalid_choices_are_refused(choice: dict[str, Any], message: str, scene: Path) -> None:
     with pytest.raises(InputError, match=message):
         read_views(replace(TrainerConfig(data=scene), **choice))

@@ -60,21 +60,21 @@ class TestPixels:
             pytest.param((-0.4, 0.3), None, (10, 6), ((2, 1), (0, 2)), id="left and down"),
             pytest.param(SHIFT, (0.5, 0.25), (12, 6), ((3, 1), (5, 0)), id="more padding"),
             pytest.param((0.1, 0.1), None, (8, 4), ((1, 0), (2, 0)), id="rounded to whole pixels"),
-            pytest.param((0, 0), (0, 0), (6, 4), ((0, 0), (0, 0)), id="nothing asked for"),
+            pytest.param((0, 0), (0, 0), (6, 4), ((0, 0), (0, 0)), id="no shift, no padding"),
         ],
     )
-    def test_every_byte_is_kept_and_all_else_is_padding(self, shift, pad, size, corners, tmp_path: Path) -> None:
+    def test_every_pixel_is_kept_and_all_else_is_padding(self, shift, pad, size, corners, tmp_path: Path) -> None:
         for split in SPLITS:
             write_scene(tmp_path / "scene", split=split)
-        made = offcenter(tmp_path / "scene", tmp_path / "out", shift, pad)
-        assert made == [tmp_path / "out" / copy for copy in COPIES]
-        for folder, corner in zip(made, corners, strict=True):
+        folders = offcenter(tmp_path / "scene", tmp_path / "out", shift, pad)
+        assert folders == [tmp_path / "out" / copy for copy in COPIES]
+        for folder, corner in zip(folders, corners, strict=True):
             for split in SPLITS:
                 for i in range(3):
                     found = iio.imread(folder / split / f"r_{i}.png")
                     np.testing.assert_array_equal(found, on_canvas(pixels(i), *size, *corner), strict=True)
 
-    def test_the_default_is_the_made_scenes_offset(self, tmp_path: Path) -> None:
+    def test_the_default_shift_is_the_synthetic_scenes_offset(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene", n=1)
         iio.imwrite(tmp_path / "scene/train/r_0.png", pixels(0, 20, 20))
         _, shifted = offcenter(tmp_path / "scene", tmp_path / "out")
@@ -90,13 +90,13 @@ class TestPixels:
             expected = on_canvas(picture, 10, 6, *corner, around=255)
             np.testing.assert_array_equal(iio.imread(folder / "train/r_0.png"), expected, strict=True)
 
-    @pytest.mark.parametrize("place", [(0, 0), (0, 3), (HEIGHT - 1, 2), (2, 0), (1, WIDTH - 1)])
-    def test_rgb_without_a_plain_border_is_refused(self, place: tuple[int, int], tmp_path: Path) -> None:
+    @pytest.mark.parametrize("pixel", [(0, 0), (0, 3), (HEIGHT - 1, 2), (2, 0), (1, WIDTH - 1)])
+    def test_rgb_without_a_plain_border_is_refused(self, pixel: tuple[int, int], tmp_path: Path) -> None:
         write_scene(tmp_path / "scene")
         for i in range(3):
             iio.imwrite(tmp_path / f"scene/train/r_{i}.png", WHITE)
         spoilt = WHITE.copy()
-        spoilt[place] = 255, 254, 255
+        spoilt[pixel] = 255, 254, 255
         iio.imwrite(tmp_path / "scene/train/r_1.png", spoilt)
         line = refusal(tmp_path / "scene", tmp_path / "out")
         assert "transforms_train.json: frames[1].file_path: './train/r_1.png' has no plain background" in line
@@ -122,8 +122,8 @@ class TestCameras:
     @pytest.fixture
     def folders(self, tmp_path: Path) -> list[Path]:
         """A synthetic scene, its centered and its shifted copy."""
-        made = make_scenes(tmp_path, ["mic"], size=20, num_train=2, num_val=1, num_test=1, placement="centered")
-        return [*made, *offcenter(made[0], tmp_path / "out")]
+        scenes = make_scenes(tmp_path, ["mic"], size=20, num_train=2, num_val=1, num_test=1, placement="centered")
+        return [*scenes, *offcenter(scenes[0], tmp_path / "out")]
 
     @staticmethod
     def seen(picture: Picture, corner: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -144,7 +144,7 @@ class TestCameras:
                 for key in expected:
                     np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=1e-6, err_msg=key)
 
-    def test_without_cx_and_cy_the_rays_are_others(self, folders: list[Path]) -> None:
+    def test_without_cx_and_cy_the_rays_differ(self, folders: list[Path]) -> None:
         doc = read_json(folders[2])
         del doc["cx"], doc["cy"]
         write_json(folders[2], doc)
@@ -161,7 +161,7 @@ class TestCameras:
             by_angle = 0.5 * 28 / math.tan(0.5 * doc["camera_angle_x"])  # all that some loaders read
             np.testing.assert_allclose(by_angle, focal[:, 0], rtol=1e-14)
 
-    def test_lengths_and_principal_points_of_the_source(self, tmp_path: Path) -> None:
+    def test_focal_lengths_and_principal_points_of_the_source(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")
         doc |= {"fl_x": 10.1, "fl_y": 11.5, "cx": 2.5, "w": WIDTH, "h": float(HEIGHT)}
         doc["frames"][1] |= {"fl_x": 20.25, "cy": 1.75}
@@ -172,7 +172,7 @@ class TestCameras:
             np.testing.assert_array_equal(focal_lengths(views), [[10.1, 11.5], [20.25, 11.5], [10.1, 11.5]])
             np.testing.assert_array_equal(principal_points(views) - corner, [[2.5, 2], [2.5, 1.75], [2.5, 2]])
 
-    def test_sizes_may_differ_and_then_there_is_no_one_angle(self, tmp_path: Path) -> None:
+    def test_views_of_different_sizes_get_no_common_angle(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")
         iio.imwrite(tmp_path / "scene/train/r_1.png", pixels(7, 10, 8))
         doc["frames"][1] |= {"w": 10, "h": 8}
@@ -187,7 +187,7 @@ class TestCameras:
 
 
 class TestJson:
-    def test_order_names_poses_and_further_keys_stay(self, tmp_path: Path) -> None:
+    def test_order_names_poses_and_unknown_keys_are_kept(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")
         doc |= {"aabb_scale": [4, None], "offset": "?", "frames": doc["frames"][::-1]}
         doc["frames"][0] |= {"time": {"unknown": True}, "file_path": "train/../train/r_2"}
@@ -196,7 +196,7 @@ class TestJson:
             found = read_json(folder)
             new = {"w", "h", "fl_x", "fl_y", "cx", "cy"}
             assert set(found) == set(doc) | new
-            assert all(found[key] == doc[key] for key in doc if key != "camera_angle_x")  # frames to the last bit
+            assert all(found[key] == doc[key] for key in doc if key != "camera_angle_x")  # frames bit for bit
             views = read_blender(folder, "train")
             assert views.names == ("train/../train/r_2", "./train/r_1", "./train/r_0")
             assert len(views.images) == 3
@@ -230,9 +230,11 @@ class TestJson:
             pytest.param("file_path", "../r_0", "leads out of the folder", id="out"),
         ],
     )
-    def test_paths_that_would_overwrite_or_leave(self, key: str, path: str, says: str, tmp_path: Path) -> None:
+    def test_paths_that_overwrite_another_picture_or_leave_the_folder_are_refused(
+        self, key: str, path: str, says: str, tmp_path: Path
+    ) -> None:
         doc = write_scene(tmp_path / "scene")
-        os.rename(tmp_path / "scene/train/r_2.png", tmp_path / "scene/train/r_1.jpg")  # in the content lies the kind
+        os.rename(tmp_path / "scene/train/r_2.png", tmp_path / "scene/train/r_1.jpg")  # a PNG whatever its name
         doc["frames"][2]["file_path"] = "train/r_1.jpg"
         if key == "mask_path" or path.startswith(".."):
             doc["frames"].pop()
@@ -248,13 +250,13 @@ class TestClipping:
     def scene(folder: Path, *objects: tuple[slice, slice], split: Split = "train", channels: int = 4) -> None:
         """A view for each object, the rest background."""
         write_scene(folder, n=len(objects), split=split)
-        for i, place in enumerate(objects):
+        for i, window in enumerate(objects):
             picture = np.full((HEIGHT, WIDTH, channels), 0 if channels == 4 else 255, np.uint8)
-            picture[place] = 7
+            picture[window] = 7
             iio.imwrite(folder / split / f"r_{i}.png", picture)
 
     @pytest.mark.parametrize("channels", [3, 4])
-    def test_background_may_go(self, channels: int, tmp_path: Path) -> None:
+    def test_background_may_be_cut_off(self, channels: int, tmp_path: Path) -> None:
         self.scene(tmp_path / "scene", np.s_[1:3, 1:4], channels=channels)
         _, shifted = offcenter(tmp_path / "scene", tmp_path / "out", SHIFT, (0, 0))
         around = 0 if channels == 4 else 255
@@ -264,7 +266,7 @@ class TestClipping:
             principal_points(read_blender(shifted, "train")), [[WIDTH / 2 + 2, HEIGHT / 2 - 1]]
         )
 
-    def test_the_object_may_not(self, tmp_path: Path) -> None:
+    def test_an_object_that_would_be_cut_off_is_refused(self, tmp_path: Path) -> None:
         self.scene(tmp_path / "scene", np.s_[1:3, 1:4], np.s_[0:3, 1:5])
         self.scene(tmp_path / "scene", np.s_[1:3, 2:6], split="test")
         line = refusal(tmp_path / "scene", tmp_path / "out", shift=SHIFT, pad=(0, 0))
@@ -293,16 +295,16 @@ class TestClipping:
 
 
 class TestOut:
-    def test_what_is_there_is_never_touched(self, tmp_path: Path) -> None:
+    def test_existing_files_are_never_touched(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene")
         (tmp_path / "out").mkdir()
-        (tmp_path / "out/mine.txt").write_text("mine")
-        (tmp_path / "file").write_text("mine")
+        (tmp_path / "out/notes.txt").write_text("keep")
+        (tmp_path / "file").write_text("keep")
         assert "out is there already" in refusal(tmp_path / "scene", tmp_path / "out")
         assert "scene is there already" in refusal(tmp_path / "scene", tmp_path / "scene")
         assert "file is there already" in refusal(tmp_path / "scene", tmp_path / "file")
         assert "not a folder" in refusal(tmp_path / "scene", tmp_path / "file/below")
-        assert (tmp_path / "out/mine.txt").read_text() == (tmp_path / "file").read_text() == "mine"
+        assert (tmp_path / "out/notes.txt").read_text() == (tmp_path / "file").read_text() == "keep"
 
     def test_an_empty_folder_is_filled(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_scene(tmp_path / "scene")
@@ -315,10 +317,10 @@ class TestOut:
     @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
     def test_a_failure_leaves_nothing_behind(self, error: type[BaseException], tmp_path: Path) -> None:
         write_scene(tmp_path / "scene")
-        told = []
+        calls = []
 
         def fail(done: int, total: int) -> None:
-            told.append((done, total))
+            calls.append((done, total))
             if done == 2:
                 assert list((tmp_path / "deep").glob(".partial-*/out/shifted/train/*.png"))  # work was under way
                 assert not (tmp_path / "deep/out").exists()
@@ -326,21 +328,21 @@ class TestOut:
 
         with pytest.raises(error):
             offcenter(tmp_path / "scene", tmp_path / "deep/out", progress=fail)
-        assert told == [(1, 3), (2, 3)]
+        assert calls == [(1, 3), (2, 3)]
         assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
     def test_a_bad_split_is_found_before_anything_is_written(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene")
         doc = write_scene(tmp_path / "scene", split="test")
         write_json(tmp_path / "scene", doc | {"camera_angle_x": -ANGLE}, "test")
-        told = []
-        line = refusal(tmp_path / "scene", tmp_path / "out", progress=lambda done, total: told.append(done))
+        calls = []
+        line = refusal(tmp_path / "scene", tmp_path / "out", progress=lambda done, total: calls.append(done))
         assert "transforms_test.json: camera_angle_x" in line
-        assert not told
+        assert not calls
 
 
 class TestCommand:
-    def test_it_does_what_it_says(self, scene: Path, tmp_path: Path, edge_se) -> None:
+    def test_both_copies_are_written_and_their_paths_printed(self, scene: Path, tmp_path: Path, edge_se) -> None:
         out = tmp_path / "out"
         answer = edge_se("offcenter", "--data", scene, "--out", out, "--shift", -0.25, 0.125, "--pad", 0.3, 0.125)
         assert (answer.code, answer.err) == (0, "")

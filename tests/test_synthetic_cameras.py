@@ -1,4 +1,4 @@
-"""Synthetic scenes: where the views look from, and the places of the object in them."""
+"""Synthetic scenes: where the views look from, and where in them the object is seen."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def test_seed_moves_train_and_val_but_not_test() -> None:
 @pytest.mark.parametrize("split", SPLITS)
 def test_cameras_look_at_the_origin_from_the_upper_hemisphere(split: Split) -> None:
     for pose in poses(split, 40):
-        turn, eye = pose[:3, :3], pose[:3, 3]
+        rotation, eye = pose[:3, :3], pose[:3, 3]
         assert np.linalg.norm(eye) == pytest.approx(DISTANCE, abs=1e-9)
-        np.testing.assert_allclose(turn[:, 2], eye / DISTANCE, atol=1e-9)  # back; the camera looks along -z
-        np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-9)
-        assert np.linalg.det(turn) == pytest.approx(1)
-        assert turn[2, 0] == 0  # the horizon is level
-        assert turn[2, 1] > 0  # and the right way up
+        np.testing.assert_allclose(rotation[:, 2], eye / DISTANCE, atol=1e-9)  # back; the camera looks along -z
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-9)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+        assert rotation[2, 0] == 0  # the horizon is level
+        assert rotation[2, 1] > 0  # and the right way up
         assert eye[2] > 0
 
 
@@ -54,7 +54,7 @@ def test_train_cameras_are_uniform_in_area() -> None:
         assert np.abs(values - ideal).max() < 2.7 / math.sqrt(4000)
 
 
-def test_test_cameras_are_spread() -> None:
+def test_test_cameras_are_spread_evenly() -> None:
     for count in (5, 10, 33):
         eyes = np.array(poses("test", count))[:, :3, 3]
         azimuth = np.sort(np.arctan2(eyes[:, 1], eyes[:, 0])) / (2 * np.pi)
@@ -71,8 +71,8 @@ def test_shifted_and_padded_are_the_centered_picture_pasted(name: str) -> None:
     scene = synthetic_scene(name)
     pose = poses("train", 2)[1]
     size, frame = 40, 24
-    places: list[tuple[Placement, int, int]] = [("shifted", 8, -6), ("padded", 0, 0)]
-    for placement, dx, dy in places:
+    placements: list[tuple[Placement, int, int]] = [("shifted", 8, -6), ("padded", 0, 0)]
+    for placement, dx, dy in placements:
         pasted = np.zeros((size, size, 4), dtype=np.uint8)
         top, left = (size - frame) // 2 + dy, (size - frame) // 2 + dx
         pasted[top : top + frame, left : left + frame] = render(scene, framing(frame).camera(pose))
@@ -93,10 +93,10 @@ def test_rotated_shows_the_origin_where_shifted_does(size: int) -> None:
         seen_at = (size / 2 - camera.focal * x / z, size / 2 + camera.focal * y / z)
         assert seen_at == pytest.approx(shifted.principal, abs=1e-8)
         np.testing.assert_array_equal(camera.to_world[:3, 3], pose[:3, 3])
-        turn = camera.to_world[:3, :3]
-        np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-11)
-        assert np.linalg.det(turn) == pytest.approx(1)
-        angle = math.acos((np.trace(turn.T @ pose[:3, :3]) - 1) / 2)  # no more than the tilt: no roll
+        rotation = camera.to_world[:3, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-11)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+        angle = math.acos((np.trace(rotation.T @ pose[:3, :3]) - 1) / 2)  # no more than the tilt: no roll
         assert angle == pytest.approx(math.acos(-z / DISTANCE), abs=1e-6)
 
 

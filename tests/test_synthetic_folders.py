@@ -1,9 +1,8 @@
-"""Synthetic scenes: honest folders, refusals, and nothing left behind."""
+"""Synthetic scenes: folders, bad input, and nothing left behind."""
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import math
 import os
@@ -17,18 +16,12 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.synthetic import ANALOG_OF, make_scenes, render_view
+from edge_se_sampler.data.synthetic import ANALOG_OF, Camera, make_scenes, render, synthetic_scene
 from edge_se_sampler.data.synthetic.cameras import FIELD_OF_VIEW, Placement, Split, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
-from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 OFFSET = (0.2, -0.15)
-
-
-def digest(*arrays: np.ndarray) -> str:
-    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 
 def everything_below(folder: Path) -> dict[str, bytes]:
@@ -37,13 +30,13 @@ def everything_below(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("placement", ["centered", "padded", "shifted", "rotated"])
-def test_folder_tells_the_truth(placement: Placement, tmp_path: Path) -> None:
+def test_pictures_are_what_the_json_says(placement: Placement, tmp_path: Path) -> None:
     """Every picture is what its json says, read as any loader of Blender scenes reads it."""
     size = 24
-    made = make_scenes(
+    folders = make_scenes(
         tmp_path, ["bricks"], size=size, num_train=2, num_val=0, num_test=1, placement=placement, offset=OFFSET, seed=3
     )
-    assert made == [tmp_path / "bricks"]
+    assert folders == [tmp_path / "bricks"]
     assert sorted(everything_below(tmp_path)) == [
         "bricks",
         "bricks/test",
@@ -69,14 +62,15 @@ def test_folder_tells_the_truth(placement: Placement, tmp_path: Path) -> None:
             assert (picture.shape, picture.dtype) == ((size, size, 4), np.uint8)
             focal = 0.5 * size / math.tan(0.5 * document["camera_angle_x"])
             principal = (document.get("cx", size / 2), document.get("cy", size / 2))
-            np.testing.assert_array_equal(picture, render_view("bricks", pose, focal, principal, size, size))
+            camera = Camera(pose, focal, principal, size, size)
+            np.testing.assert_array_equal(picture, render(synthetic_scene("bricks"), camera))
             assert picture[..., 3].max() == 255
             assert not picture[picture[..., 3] == 0].any()
 
 
-def test_processes_make_the_same_pictures(tmp_path: Path) -> None:
+def test_worker_processes_render_the_same_pictures(tmp_path: Path) -> None:
     """Six views and more go to other processes."""
-    heard: list[tuple[int, int]] = []
+    calls: list[tuple[int, int]] = []
     make_scenes(
         tmp_path / "new" / "out",
         ["mic", "chair"],
@@ -84,10 +78,10 @@ def test_processes_make_the_same_pictures(tmp_path: Path) -> None:
         num_train=3,
         num_val=1,
         num_test=2,
-        progress=lambda done, total: heard.append((done, total)),
+        progress=lambda done, total: calls.append((done, total)),
     )
     assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == ["chair", "mic"]
-    assert heard == [(done, 12) for done in range(1, 13)]
+    assert calls == [(done, 12) for done in range(1, 13)]
     for name in ("mic", "chair"):
         assert (
             json.loads((tmp_path / f"new/out/{name}/transforms_val.json").read_text())["analog_of"] == ANALOG_OF[name]
@@ -132,7 +126,7 @@ def test_refusals_leave_nothing_behind(arguments: dict, message: str, tmp_path: 
 
 def test_an_existing_scene_is_never_touched(tmp_path: Path) -> None:
     (tmp_path / "mic").mkdir()
-    (tmp_path / "mic" / "mine.txt").write_text("mine")
+    (tmp_path / "mic" / "notes.txt").write_text("keep")
     before = everything_below(tmp_path)
     with pytest.raises(InputError, match="mic is there already"):
         make_scenes(tmp_path, ["chair", "mic"], size=8, num_train=1, num_val=0, num_test=0)
@@ -151,19 +145,19 @@ def test_a_folder_filled_meanwhile_is_never_touched(tmp_path: Path) -> None:
     (tmp_path / "mic").mkdir()
 
     def intrude(done: int, total: int) -> None:
-        (tmp_path / "mic" / "mine.txt").write_text("mine")
+        (tmp_path / "mic" / "notes.txt").write_text("keep")
 
     with pytest.raises(OSError):
         make_scenes(tmp_path, ["mic"], size=8, num_train=1, num_val=0, num_test=0, progress=intrude)
-    assert everything_below(tmp_path) == {"mic": b"", "mic/mine.txt": b"mine"}
+    assert everything_below(tmp_path) == {"mic": b"", "mic/notes.txt": b"keep"}
 
 
 @pytest.mark.parametrize("out", ["file", "file/below"])
 def test_out_that_is_a_file(out: str, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("mine")
+    (tmp_path / "file").write_text("keep")
     with pytest.raises(InputError, match=r"out is .*file.* not a folder"):
         make_scenes(tmp_path / out, ["mic"], size=8, num_train=1, num_val=0, num_test=0)
-    assert everything_below(tmp_path) == {"file": b"mine"}
+    assert everything_below(tmp_path) == {"file": b"keep"}
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="everything is writable to root")
@@ -189,7 +183,7 @@ def test_a_failure_leaves_nothing_behind(num_train: int, error: type[BaseExcepti
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing_behind(tmp_path: Path) -> None:
     def fail(done: int, total: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -233,8 +227,8 @@ def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
                 time.sleep(0.01)
             time.sleep(0.15)
         os.killpg(process.pid, signal.SIGINT)
-        said, complained = process.communicate(timeout=20)
-    assert said.splitlines()[-1] == "stopped"
-    assert complained == ""
+        out, err = process.communicate(timeout=20)
+    assert out.splitlines()[-1] == "stopped"
+    assert err == ""
     assert process.returncode == 0
     assert [path.name for path in tmp_path.iterdir()] == ["script.py"]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.synthetic import SCENE_NAMES, render_view
+from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import DISTANCE, Camera, framing, poses
 from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
 from edge_se_sampler.data.synthetic.linear import inverse_affine, rotation, unit
@@ -85,7 +85,7 @@ def test_rays_along_an_axis_hit(kind: Kind, taper: tuple[float, float], axis: in
 
 
 @pytest.mark.parametrize(("kind", "taper"), SOLIDS)
-def test_normals_are_square_to_the_surface(kind: Kind, taper: tuple[float, float]) -> None:
+def test_normals_are_perpendicular_to_the_surface(kind: Kind, taper: tuple[float, float]) -> None:
     """Three neighbouring rays hit a small triangle; its normal is the surface's, but where it spans an edge."""
     random = np.random.RandomState(2)
     taper_array = np.array(taper)
@@ -137,7 +137,7 @@ def assert_first_hits_are_brute_force(scene: Scene, camera: Camera) -> np.ndarra
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_bounds_change_no_answer(name: str) -> None:
+def test_bounding_boxes_change_no_result(name: str) -> None:
     scene = synthetic_scene(name)
     camera = framing(40, "rotated", OFFSET).camera(poses("train", 5)[4])
     points = assert_first_hits_are_brute_force(scene, camera)[:, :200]
@@ -173,7 +173,7 @@ def test_the_whole_scene_is_in_the_ball(name: str) -> None:
 
 def test_alpha_of_a_ball_is_its_silhouette() -> None:
     builder = SceneBuilder()
-    builder.sphere((3.0, -2.0, 5.0), 0.7, Material((0.5, 0.5, 0.5)))  # built in any place, moved to the origin
+    builder.sphere((3.0, -2.0, 5.0), 0.7, Material((0.5, 0.5, 0.5)))  # built anywhere, moved to the origin
     scene = builder.build()
     camera = framing(64, "shifted", (0.1, 0.05)).camera(poses("val", 3)[2])
     picture = render(scene, camera)
@@ -184,8 +184,8 @@ def test_alpha_of_a_ball_is_its_silhouette() -> None:
     from_center = np.hypot(*np.meshgrid(samples - camera.principal[0], samples - camera.principal[1]))
     cone = math.tan(math.asin(BALL_RADIUS / DISTANCE))  # the camera looks at the ball's center: a circle
     seen = from_center / camera.focal < cone
-    share = seen.reshape(64, SAMPLES_PER_AXIS, 64, SAMPLES_PER_AXIS).mean(axis=(1, 3))
-    np.testing.assert_array_equal(alpha, np.rint(255 * share))
+    covered = seen.reshape(64, SAMPLES_PER_AXIS, 64, SAMPLES_PER_AXIS).mean(axis=(1, 3))
+    np.testing.assert_array_equal(alpha, np.rint(255 * covered))
     assert alpha.sum() / 255 == pytest.approx(math.pi * (camera.focal * cone) ** 2, rel=0.01)
     faint = (alpha > 0) & (alpha < 64)  # straight alpha: a pixel barely touched is as bright as its neighbours
     assert faint.sum() > 5
@@ -202,16 +202,16 @@ def test_inverse_affine_inverts() -> None:
 
 def test_rotation_is_right_handed() -> None:
     np.testing.assert_allclose(rotation((0, 0, 5), 90) @ (1, 0, 0), (0, 1, 0), atol=1e-15)
-    turn = rotation((1, -2, 0.5), 73)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    assert np.trace(turn) == pytest.approx(1 + 2 * math.cos(math.radians(73)))
+    matrix = rotation((1, -2, 0.5), 73)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(matrix) == pytest.approx(1)
+    assert np.trace(matrix) == pytest.approx(1 + 2 * math.cos(math.radians(73)))
 
 
 def test_a_solid_behind_the_camera_is_not_seen() -> None:
     pose = poses("train", 1)[0].copy()
-    pose[:3, :3] = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])  # turned about
-    assert not render_view("hotdog", pose, 40.0, (16.0, 16.0), 32, 32).any()
+    pose[:3, :3] = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])  # looks the other way
+    assert not render(synthetic_scene("hotdog"), Camera(pose, 40.0, (16.0, 16.0), 32, 32)).any()
 
 
 def test_a_camera_amid_the_scene_sees_what_is_around_it() -> None:

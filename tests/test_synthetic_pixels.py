@@ -21,7 +21,7 @@ from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.data.synthetic.shading import radiance
 from edge_se_sampler.data.synthetic.visibility import first_hits
 
-# sha256 of the pixels of one 32 x 32 view. A change here changes every made picture that anyone has.
+# sha256 of the pixels of one 32 x 32 view. A change here changes every synthetic picture that anyone has.
 PIXELS = {
     "chair": "058f25527133d9a9ea63d6b54c17df324fa094bdbeb5f6845821e6aff463569c",
     "drums": "12828348bfba12172c76484d6895f4eba8d55954431ec4607f68f10bb5609266",
@@ -48,15 +48,15 @@ def float_digest(name: str) -> str:
     depth, seen = first_hits(scene, camera, 1)
     rows, columns = np.nonzero(seen >= 0)
     x, y = camera.sample_slopes(1)
-    turn = camera.to_world[:3, :3]
-    rays = turn[:, 0, None] * x[columns] + turn[:, 1, None] * y[rows] - turn[:, 2, None]
+    rotation = camera.to_world[:3, :3]
+    rays = rotation[:, 0, None] * x[columns] + rotation[:, 1, None] * y[rows] - rotation[:, 2, None]
     points = camera.to_world[:3, 3:4] + depth[rows, columns] * rays
     light = radiance(scene, seen[rows, columns], points, unit(rays))
     return digest(camera.to_world, scene.to_world, scene.to_local, depth, seen, light)
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_pixels_are_the_committed_ones(name: str) -> None:
+def test_pixels_are_bit_identical_to_the_recorded_ones(name: str) -> None:
     assert digest(small_picture(name)) == PIXELS[name]
 
 

@@ -12,22 +12,6 @@ from pathlib import Path
 from edge_se_sampler.errors import InputError
 
 
-def check_not_taken(out: Path, targets: Sequence[Path]) -> None:
-    """Raises InputError unless every target, a path in `out`, can be written without touching anything there."""
-    try:
-        existing = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
-        if not existing.is_dir():
-            raise InputError(f"out is {out}, but {existing} is not a folder: give a folder, or a path that is free")
-        if not os.access(existing, os.W_OK | os.X_OK):
-            raise InputError(f"out is {out}, but {existing} is not writable: give a folder that is")
-        for target in targets:
-            empty_folder = target.is_dir() and not target.is_symlink() and not any(target.iterdir())
-            if os.path.lexists(target) and not empty_folder:
-                raise InputError(f"{target} is there already and is never overwritten: remove it, or give another out")
-    except OSError as error:
-        raise InputError(f"out is {out}, which cannot be read ({error.strerror}): give another folder") from error
-
-
 @contextmanager
 def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
     """A temporary folder inside `out` in which to write workspace/<name> of every target; at the end they are moved.
@@ -35,9 +19,10 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
     On any exception the temporary folder is removed, and with it the folders that were created for `out`.
 
     Raises:
-        InputError: `out` cannot be written, or the disk is full.
+        InputError: a target is there and not empty, `out` cannot be written, or the disk is full.
         OSError: a target was empty and no longer is; nothing is overwritten.
     """
+    _check_not_taken(out, targets)
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         try:
@@ -58,3 +43,19 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise InputError(f"out is {out}, whose disk is full: nothing was left there; give another") from error
         raise
+
+
+def _check_not_taken(out: Path, targets: Sequence[Path]) -> None:
+    """Raise InputError unless every target, a path in `out`, can be written without touching anything there."""
+    try:
+        existing = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
+        if not existing.is_dir():
+            raise InputError(f"out is {out}, but {existing} is not a folder: give a folder, or a path that is free")
+        if not os.access(existing, os.W_OK | os.X_OK):
+            raise InputError(f"out is {out}, but {existing} is not writable: give a folder that is")
+        for target in targets:
+            empty_folder = target.is_dir() and not target.is_symlink() and not any(target.iterdir())
+            if os.path.lexists(target) and not empty_folder:
+                raise InputError(f"{target} is there already and is never overwritten: remove it, or give another out")
+    except OSError as error:
+        raise InputError(f"out is {out}, which cannot be read ({error.strerror}): give another folder") from error

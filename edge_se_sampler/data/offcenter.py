@@ -21,7 +21,7 @@ import numpy as np
 from edge_se_sampler.data.blender import SPLITS, Split, has_split, listed_file, read_blender, transforms_path
 from edge_se_sampler.data.canvas import COPIES, Canvas, object_mask, plain_background
 from edge_se_sampler.data.json_value import JsonValue, read_json
-from edge_se_sampler.data.new_folder import check_not_taken, staged_folders
+from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.source_location import quote
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
@@ -69,11 +69,10 @@ def offcenter(
     """
     _check_fractions(shift, pad)
     data, target = Path(data), Path(os.path.abspath(out))
-    check_not_taken(target.parent, [target])
-    plans = _plan_splits(data, shift, pad)
-    done, total = 0, sum(len(plan.files) for plan in plans)
     with staged_folders(target.parent, [target]) as workspace, ThreadPoolExecutor() as pool:
         folder = workspace / target.name
+        plans = _plan_splits(data, shift, pad)
+        done, total = 0, sum(len(plan.files) for plan in plans)
         for plan in plans:
             views = read_blender(data, plan.split)
             canvases = [Canvas.of(image, shift, pad) for image in views.images]

@@ -13,7 +13,7 @@ from edge_se_sampler.data.synthetic import make_scenes
 
 @pytest.fixture(scope="session")
 def host_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A made Blender folder: 4 training views, 2 val, 2 test, 32 x 32; and LPIPS weights to load."""
+    """A synthetic Blender folder: 4 training views, 2 val, 2 test, 32 x 32; and LPIPS weights to load."""
     if importlib.util.find_spec("nerfstudio") is None or importlib.util.find_spec("torchvision") is None:
         pytest.skip("needs all of nerfstudio 1.1.5")
     from full_host import without_lpips_downloads
@@ -23,5 +23,5 @@ def host_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     os.environ["TORCH_HOME"] = str(tmp_path_factory.mktemp("torch"))
     without_lpips_downloads()
     return make_scenes(
-        tmp_path_factory.mktemp("made"), ["mic"], size=32, num_train=4, num_val=2, num_test=2, placement="shifted"
+        tmp_path_factory.mktemp("synthetic"), ["mic"], size=32, num_train=4, num_val=2, num_test=2, placement="shifted"
     )[0]

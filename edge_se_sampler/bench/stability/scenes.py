@@ -12,8 +12,8 @@ from torch import Tensor
 
 from edge_se_sampler.bench.stability.settings import Background
 from edge_se_sampler.data.cameras import Cameras, RayBundle
+from edge_se_sampler.data.synthetic import Camera, render, synthetic_scene
 from edge_se_sampler.data.synthetic.cameras import poses
-from edge_se_sampler.data.synthetic.render import render_view
 from edge_se_sampler.data.views import Views
 
 SCENE = "materials"
@@ -57,7 +57,8 @@ def _render(split: str, focal: float, shifted: bool, count: int) -> Views:
     dx, dy = SHIFT if shifted else (0, 0)
     cx, cy = SIZE / 2 + dx, SIZE / 2 + dy
     matrices = poses("test" if split == "test" else "train", count)
-    images = tuple(render_view(SCENE, pose, focal, (cx, cy), SIZE, SIZE) for pose in matrices)
+    scene = synthetic_scene(SCENE)
+    images = tuple(render(scene, Camera(pose, focal, (cx, cy), SIZE, SIZE)) for pose in matrices)
     cameras = Cameras.of(matrices, fx=focal, fy=focal, cx=cx, cy=cy, width=SIZE, height=SIZE)
     return Views(tuple(f"{split}/r_{i}" for i in range(count)), images, None, cameras)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES
+from edge_se_sampler.data.synthetic.cameras import Camera
+from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES, synthetic_scene
 from edge_se_sampler.data.synthetic.folder import make_scenes
-from edge_se_sampler.data.synthetic.render import render_view
+from edge_se_sampler.data.synthetic.render import render
 
-__all__ = ["ANALOG_OF", "SCENE_NAMES", "make_scenes", "render_view"]
+__all__ = ["ANALOG_OF", "SCENE_NAMES", "Camera", "make_scenes", "render", "synthetic_scene"]

@@ -17,7 +17,7 @@ import imageio.v3 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_se_sampler.data.new_folder import check_not_taken, staged_folders
+from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.synthetic.cameras import Camera, Framing, Placement, Split, framing, poses
 from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES, check_name, synthetic_scene
 from edge_se_sampler.data.synthetic.render import render
@@ -79,7 +79,6 @@ def make_scenes(
     _check_numbers(counts, seed)
     frame = framing(size, placement, offset)
     targets = [Path(out) / name for name in names]
-    check_not_taken(Path(out), targets)
 
     cameras: dict[Split, list[Camera]] = {
         split: [frame.camera(pose) for pose in poses(split, count, seed)] for split, count in counts.items()

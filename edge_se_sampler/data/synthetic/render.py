@@ -7,11 +7,10 @@ is the mean radiance of those alone (straight alpha), clipped, sRGB-encoded. Flo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from edge_se_sampler.data.synthetic.cameras import Camera
-from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
-from edge_se_sampler.data.synthetic.linear import Array, apply, unit, vector
+from edge_se_sampler.data.synthetic.linear import Array, apply, unit
 from edge_se_sampler.data.synthetic.scene import Scene
 from edge_se_sampler.data.synthetic.shading import radiance
 from edge_se_sampler.data.synthetic.visibility import NOTHING, first_hits
@@ -31,22 +30,12 @@ def _srgb_steps() -> Array:
 _SRGB_STEPS = _srgb_steps()
 
 
-def render_view(
-    name: str, camera_to_world: ArrayLike, focal: float, principal: tuple[float, float], width: int, height: int
-) -> NDArray[np.uint8]:
-    """One view of a synthetic scene.
-
-    `camera_to_world` is (4, 4) or (3, 4) in NeRF's convention (x right, y up, looking along -z; a rotation and an eye
-    in world units), `focal` and `principal` (x, y) are in pixels, pixel (0, 0) having its center at (0.5, 0.5).
-    Returns (height, width, 4) RGBA, 8 bits, straight alpha, sRGB-encoded; the same bytes on every machine.
-
-    Raises InputError for a name that is not in SCENE_NAMES.
-    """
-    return render(synthetic_scene(name), Camera(vector(camera_to_world), focal, principal, width, height))
-
-
 def render(scene: Scene, camera: Camera) -> NDArray[np.uint8]:
-    """The camera's picture (height, width, 4) of the scene: RGBA, 8 bits, straight alpha."""
+    """The camera's picture of the scene.
+
+    Returns:
+        (height, width, 4) RGBA, 8 bits, straight alpha, sRGB-encoded; the same bytes on every machine.
+    """
     depth, seen = first_hits(scene, camera, SAMPLES_PER_AXIS)
     rows, columns = np.nonzero(seen != NOTHING)
     pixels = rows // SAMPLES_PER_AXIS * camera.width + columns // SAMPLES_PER_AXIS
