@@ -359,7 +359,6 @@ class TestCommand:
             (("--shift", 0, 1), "between -1 and 1"),
             (("--shift", -1.5, 0), "between -1 and 1"),
             (("--shift", "inf", 0), "between -1 and 1"),
-            (("--shift", "far", 0), "--shift"),
             (("--pad", -0.1, 0), "from 0 to 1"),
             (("--pad", "nan", 0), "from 0 to 1"),
             (("--pad", 0, 1e9), "from 0 to 1"),
@@ -371,6 +370,6 @@ class TestCommand:
     )
     def test_bad_input(self, flags, says: str, scene: Path, tmp_path: Path, edge_se, monkeypatch) -> None:
         monkeypatch.chdir(tmp_path)
-        there = sorted(tmp_path.rglob("*"))
+        before = sorted(tmp_path.rglob("*"))
         assert says in refused(edge_se, tmp_path, "offcenter", "--data", scene, "--out", "out", *flags)
-        assert sorted(tmp_path.rglob("*")) == there
+        assert sorted(tmp_path.rglob("*")) == before
