@@ -136,7 +136,7 @@ class Eval:
     """Folder for pictures of the views: ground truth on the left, rendering on the right."""
 
     def run(self) -> None:
-        from edge_se_sampler.engine.reports import evaluate_run
+        from edge_se_sampler.engine.evaluation import evaluate_run
         from edge_se_sampler.engine.run_folder import RunFolder
 
         run = RunFolder(self.run_folder)
@@ -160,8 +160,8 @@ class Render:
     """Frame rate of the video."""
 
     def run(self) -> None:
-        from edge_se_sampler.engine.reports import render_run
         from edge_se_sampler.engine.run_folder import RunFolder
+        from edge_se_sampler.engine.video import render_run
 
         run = RunFolder(self.run_folder)
         config = run.config(method_configs())

@@ -10,13 +10,13 @@ import pytest
 
 from edge_se_sampler.bench.outcomes import classify, failed, foreground_share, measure_background, measure_outcome
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.engine.metrics import composite_on, compute_metrics
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 
 
 @pytest.fixture
 def pictures(scene: Path) -> list[Picture]:
-    return pictures_of(read_blender(scene, "train"))
+    return to_pictures(read_blender(scene, "train"))
 
 
 def measure(pictures: list[Picture], whiten: float) -> dict[str, Any]:

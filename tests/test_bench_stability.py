@@ -26,8 +26,8 @@ from edge_se_sampler.bench.stability.train import (
     render_networks,
     run_trial,
 )
-from edge_se_sampler.engine.evaluation import pictures_of
 from edge_se_sampler.engine.reinitialization import dead_networks
+from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.sampling.edges import edge_strength
 
@@ -84,7 +84,7 @@ def test_off_centre_shows_the_same_picture_shifted_by_whole_pixels() -> None:
 
 
 def test_backgrounds() -> None:
-    rays = pictures_of(render_splits(0.05, False, 3)[1])[0].rays(CPU)
+    rays = to_pictures(render_splits(0.05, False, 3)[1])[0].rays(CPU)
     green, textured = background_of("green"), background_of("textured")
     assert background_of("random") is None
     assert green is not None

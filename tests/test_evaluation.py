@@ -14,14 +14,9 @@ from tiny import tiny_config, tiny_views, with_constant_density
 from torch import Tensor
 
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.evaluation import (
-    Picture,
-    evaluate,
-    pictures_of,
-    render_rays,
-    render_view,
-)
+from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on
+from edge_se_sampler.engine.rendering import Picture, render_rays, render_view, to_pictures
 from edge_se_sampler.models import nerf as model_module
 from edge_se_sampler.models.nerf import NeRFModel
 
@@ -48,7 +43,7 @@ def test_the_mean_over_images_is_not_the_pooled_psnr() -> None:
     views = views_of(*(np.full((HEIGHT, WIDTH, 3), level, dtype=np.uint8) for level in levels))
     errors = [(1 - int(level) / 255) ** 2 for level in levels]
     each = [-10 * math.log10(error) for error in errors]
-    result = evaluate(empty_model(), pictures_of(views))
+    result = evaluate(empty_model(), to_pictures(views))
     assert result["psnr"] == pytest.approx(sum(each) / 2, abs=1e-4)
     assert result["psnr_std"] == pytest.approx(abs(each[0] - each[1]) / 2, abs=1e-4)
     assert result["psnr_pooled"] == pytest.approx(-10 * math.log10(sum(errors) / 2), abs=1e-4)
@@ -66,7 +61,7 @@ def test_a_dead_model_has_the_backgrounds_psnr(name: Any, shade: float) -> None:
         pixels = image.astype(np.float64) / 255
         shown = pixels[..., :3] * pixels[..., 3:] + shade * (1 - pixels[..., 3:])
         expected.append(-10 * math.log10(((shown - shade) ** 2).mean()))
-    result = evaluate(empty_model(background_color=name), pictures_of(views))
+    result = evaluate(empty_model(background_color=name), to_pictures(views))
     assert [row["psnr"] for row in result["images"]] == pytest.approx(expected, abs=1e-4)
 
 
@@ -74,7 +69,7 @@ def test_a_dead_model_has_the_backgrounds_psnr(name: Any, shade: float) -> None:
 def test_results_are_valid_json_even_of_a_perfect_match(channels: int) -> None:
     """White on white: no error, no edge, and without alpha no foreground; nan and inf are not json."""
     views = views_of(*(np.full((HEIGHT, WIDTH, channels), 255, dtype=np.uint8) for _ in range(2)))
-    result = evaluate(empty_model(), pictures_of(views))
+    result = evaluate(empty_model(), to_pictures(views))
     json.dumps(result, allow_nan=False)
     assert result["psnr"] == result["psnr_pooled"] == 100
     assert result["lpips"] is None
@@ -87,7 +82,7 @@ def test_a_mean_is_over_the_views_that_have_the_measure() -> None:
     seen = np.full((HEIGHT, WIDTH, 4), 255, dtype=np.uint8)
     seen[..., :3] = 102
     unseen = np.zeros((HEIGHT, WIDTH, 4), dtype=np.uint8)
-    result = evaluate(empty_model(), pictures_of(views_of(seen, unseen)))
+    result = evaluate(empty_model(), to_pictures(views_of(seen, unseen)))
     assert result["foreground_psnr"] == pytest.approx(-10 * math.log10(0.36), abs=1e-4)
     assert result["background_mse"] == 0
     assert [row["name"] for row in result["images"]] == ["view 0", "view 1"]
@@ -97,7 +92,7 @@ def test_a_view_is_rendered_pixel_by_pixel_and_clipped() -> None:
     """Row-major, and each pixel from its own ray."""
     views = tiny_views(2, 5, 7)
     model = model_of(density_activation="softplus").eval()
-    picture = pictures_of(views)[1]
+    picture = to_pictures(views)[1]
     rendered, decibel = render_view(model, picture)
     assert rendered.shape == (5, 7, 3)
     for row, column in ((0, 0), (0, 6), (4, 0), (2, 3)):
@@ -113,7 +108,7 @@ def test_a_view_is_rendered_pixel_by_pixel_and_clipped() -> None:
 @pytest.mark.parametrize("training", [True, False])
 def test_chunks_leave_no_seam_and_the_mode_as_it_was(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     model = model_of(density_noise=1.0, background_color="random").train(training)
-    picture = pictures_of(tiny_views(1, 5, 7))[0]
+    picture = to_pictures(tiny_views(1, 5, 7))[0]
     rays = picture.rays(torch.device("cpu"))
     whole = {key: render_rays(model, rays, key) for key in ("rgb_fine", "depth_fine")}
     monkeypatch.setattr(model_module, "POINTS_PER_CHUNK", {"cpu": 100})
@@ -132,7 +127,7 @@ def test_every_view_is_handed_on_in_order() -> None:
     def each(i: int, picture: Picture, image: np.ndarray) -> None:
         handed.append((i, picture.name, image))
 
-    result = evaluate(empty_model(), pictures_of(views), each)
+    result = evaluate(empty_model(), to_pictures(views), each)
     assert [(i, name) for i, name, _ in handed] == [(0, "view 0"), (1, "view 1"), (2, "view 2")]
     assert all(image.shape == (4, 5, 3) and (image == 1).all() for _, _, image in handed)
     assert len(result["images"]) == 3
@@ -146,7 +141,7 @@ def test_colours_beyond_one_are_clipped(monkeypatch: pytest.MonkeyPatch) -> None
         return {"rgb_fine": torch.full((len(rays), 3), 1.5)}
 
     monkeypatch.setattr(model, "forward", too_bright)
-    rendered, decibel = render_view(model, pictures_of(views_of(np.full((4, 4, 3), 255, dtype=np.uint8)))[0])
+    rendered, decibel = render_view(model, to_pictures(views_of(np.full((4, 4, 3), 255, dtype=np.uint8)))[0])
     assert (rendered == 1).all()
     assert decibel == 100
 
@@ -158,4 +153,4 @@ def test_a_diverged_model_is_no_result() -> None:
         model.fine.color.bias[1] = math.nan
         model.fine.density.bias.fill_(1)
     with pytest.raises(FloatingPointError, match="not finite"):
-        evaluate(model, pictures_of(tiny_views(1, 4, 4)))
+        evaluate(model, to_pictures(tiny_views(1, 4, 4)))

@@ -11,17 +11,17 @@ import pytest
 from tiny import tiny_views
 
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.session import chosen_views, read_views
+from edge_se_sampler.engine.session import read_train_views, select_views
 from edge_se_sampler.errors import InputError
 
 
 def test_num_views_picks_the_views_of_infonerfs_code() -> None:
     """From its own run: numpy.random.RandomState(0).permutation(100)[:10]."""
-    assert chosen_views(TrainerConfig(num_views=10), 100) == [26, 86, 2, 55, 75, 93, 16, 73, 54, 95]
-    assert chosen_views(TrainerConfig(num_views=4), 100) == [26, 86, 2, 55]
-    assert sorted(chosen_views(TrainerConfig(num_views=7), 7) or []) == list(range(7))
-    assert chosen_views(TrainerConfig(), 7) is None
-    assert chosen_views(TrainerConfig(views=(5, 0, 3)), 7) == [5, 0, 3]
+    assert select_views(TrainerConfig(num_views=10), 100) == [26, 86, 2, 55, 75, 93, 16, 73, 54, 95]
+    assert select_views(TrainerConfig(num_views=4), 100) == [26, 86, 2, 55]
+    assert sorted(select_views(TrainerConfig(num_views=7), 7) or []) == list(range(7))
+    assert select_views(TrainerConfig(), 7) is None
+    assert select_views(TrainerConfig(views=(5, 0, 3)), 7) == [5, 0, 3]
 
 
 def test_a_subset_keeps_every_field() -> None:
@@ -36,10 +36,10 @@ def test_a_subset_keeps_every_field() -> None:
 
 
 def test_a_run_reads_only_the_chosen_views(scene: Path) -> None:
-    everything = read_views(TrainerConfig(data=scene))
-    few = read_views(TrainerConfig(data=scene, views=(2,)))
+    everything = read_train_views(TrainerConfig(data=scene))
+    few = read_train_views(TrainerConfig(data=scene, views=(2,)))
     assert few.names == everything.names[2:]
-    assert len(read_views(TrainerConfig(data=scene, num_views=2)).names) == 2
+    assert len(read_train_views(TrainerConfig(data=scene, num_views=2)).names) == 2
 
 
 @pytest.mark.parametrize(
@@ -56,4 +56,4 @@ def test_a_run_reads_only_the_chosen_views(scene: Path) -> None:
 )
 def test_invalid_choices_are_refused(choice: dict[str, Any], message: str, scene: Path) -> None:
     with pytest.raises(InputError, match=message):
-        read_views(replace(TrainerConfig(data=scene), **choice))
+        read_train_views(replace(TrainerConfig(data=scene), **choice))

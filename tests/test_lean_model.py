@@ -18,8 +18,8 @@ from edge_se_sampler.bench.overrides import SAMPLER, override
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.evaluation import pictures_of, render_rays, render_view
 from edge_se_sampler.engine.inspection import inspect
+from edge_se_sampler.engine.rendering import render_rays, render_view, to_pictures
 from edge_se_sampler.engine.session import describe_run, load_model, prepare
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
@@ -256,7 +256,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     assert not bool(views.image_batch["mask"].all())  # live pixels alone
     assert views.train_pixel_sampler.strategy == "uniform"
     trainer.train()
-    picture = pictures_of(read_blender(larger, "test"))[0]
+    picture = to_pictures(read_blender(larger, "test"))[0]
     _, psnr = render_view(model, picture)
     away = picture.image[..., 3:] * (1 - picture.image[..., :3])
     background = -10 * np.log10(np.mean(away.astype(np.float64) ** 2))

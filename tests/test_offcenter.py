@@ -18,7 +18,7 @@ from test_cli_bad_input import refused
 from edge_se_sampler.data.blender import SPLITS, Split, read_blender
 from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.data.synthetic import make_scenes
-from edge_se_sampler.engine.evaluation import Picture, pictures_of
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.errors import InputError
 
 COPIES = ("centered", "shifted")
@@ -136,7 +136,7 @@ class TestCameras:
 
     @pytest.mark.parametrize("split", SPLITS)
     def test_every_pixel_keeps_its_ray_and_its_color(self, split: Split, folders: list[Path]) -> None:
-        source, *copies = [pictures_of(read_blender(folder, split)) for folder in folders]
+        source, *copies = [to_pictures(read_blender(folder, split)) for folder in folders]
         for pictures, corner in zip(copies, ((4, 3), (8, 6)), strict=True):
             for before, after in zip(source, pictures, strict=True):
                 assert after.image.shape == (26, 28, 4)
@@ -148,7 +148,7 @@ class TestCameras:
         doc = read_json(folders[2])
         del doc["cx"], doc["cy"]
         write_json(folders[2], doc)
-        before, after = (pictures_of(read_blender(folders[i], "train"))[0] for i in (0, 2))
+        before, after = (to_pictures(read_blender(folders[i], "train"))[0] for i in (0, 2))
         apart = self.seen(after, (8, 6))["directions"] - self.seen(before, (0, 0))["directions"]
         assert np.abs(apart).max(axis=2).min() > 0.05
 

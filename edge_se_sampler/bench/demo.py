@@ -13,13 +13,14 @@ from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MachineConfig
-from edge_se_sampler.engine.evaluation import Picture, evaluate, pictures_of
+from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.engine.run_folder import config_to_json
-from edge_se_sampler.engine.session import prepare, test_pictures
+from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 
@@ -58,7 +59,7 @@ def demo(output_dir: Path, seed: int) -> list[Outcome]:
         make_demo_scene(workplace / "scenes-tmp").rename(scene)
         (workplace / "scenes-tmp").rmdir()
     outcomes = [_train(method, scene, workplace, seed) for method in METHODS]
-    test, validation = pictures_of(read_blender(scene, "test")), pictures_of(read_blender(scene, "val"))
+    test, validation = to_pictures(read_blender(scene, "test")), to_pictures(read_blender(scene, "val"))
     background = float(np.mean([_background_psnr(picture) for picture in test]))
     _write_json(output_dir / "demo.json", outcomes, background, seed, time.monotonic() - began)
     _draw(output_dir / "demo.png", outcomes, composite_on(test[0].image), _background_psnr(validation[0]))
@@ -97,7 +98,9 @@ def _train(method: str, scene: Path, workplace: Path, seed: int) -> Outcome:
     metrics = trainer.run.metrics()
     first: list[np.ndarray] = []
     results = evaluate(
-        trainer.pipeline.model, test_pictures(trainer.config), lambda _, __, rendered: first.append(rendered)
+        trainer.pipeline.model,
+        to_pictures(read_test_views(trainer.config)),
+        lambda _, __, rendered: first.append(rendered),
     )
     return Outcome(
         method,

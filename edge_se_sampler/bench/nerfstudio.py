@@ -28,10 +28,10 @@ from edge_se_sampler.bench.machine import machine, resident_memory
 from edge_se_sampler.bench.outcome import background_measures, foreground_share, outcome
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
-from edge_se_sampler.engine.evaluation import pictures_of
 from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.errors import InputError
 
 METHODS = ("vanilla-nerf", "edge-se-nerf")
@@ -160,7 +160,7 @@ def rendered_views(trainer: Any) -> list[Any]:
 
 def _looked_at(trainer: Any, data: Path) -> dict[str, Any]:
     """PSNR on the test views, and the error on the object as a share of what the background alone has there."""
-    pictures = pictures_of(read_blender(data, "test"))
+    pictures = to_pictures(read_blender(data, "test"))
     rows = [compute_metrics(shown, p.image, 1.0) for shown, p in zip(rendered_views(trainer), pictures, strict=True)]
     background = background_measures(pictures, 1.0)
     return {

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edge_se_sampler.engine.evaluation import Picture
 from edge_se_sampler.engine.metrics import compute_metrics
+from edge_se_sampler.engine.rendering import Picture
 from edge_se_sampler.errors import InputError
 
 Outcome = Literal["converged", "underfit", "collapsed"]

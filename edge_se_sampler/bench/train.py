@@ -14,10 +14,11 @@ import torch
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.evaluation import evaluate, get_background_color
+from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.reinitialization import dead_networks
-from edge_se_sampler.engine.session import prepare, test_pictures
+from edge_se_sampler.engine.rendering import to_pictures
+from edge_se_sampler.engine.session import prepare, read_test_views
 
 MEASURES = ("psnr", "foreground_psnr", "edge_band_psnr", "background_mse")
 
@@ -36,7 +37,7 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
     torch.set_num_threads(1)  # there are as many trainings at once as cores
     with contextlib.redirect_stderr(io.StringIO()):  # progress bars of several processes would mix
         trainer = prepare(config)
-        pictures, model = test_pictures(trainer.config), trainer.pipeline.model
+        pictures, model = to_pictures(read_test_views(trainer.config)), trainer.pipeline.model
         dead = dead_networks(model, [picture.rays(model.device)[::4] for picture in pictures])
         start = time.process_time()
         trainer.train()
@@ -51,7 +52,7 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
     metrics, every = trainer.run.metrics(), trainer.config.steps_per_log
     return {
         **{key: results[key] for key in MEASURES},
-        **measure_outcome(results, pictures, get_background_color(model)),
+        **measure_outcome(results, pictures, model.config.background_level),
         "dead_at_start": dead,
         "reinitialized": sum("reinitialized" in line for line in metrics),
         "steps": trainer.next_step,

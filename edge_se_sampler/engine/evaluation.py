@@ -3,66 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from edge_se_sampler.data.cameras import Cameras, RayBundle
-from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
 from edge_se_sampler.engine.metrics import composite_on, compute_metrics, psnr
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import Picture, render_view, to_pictures
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import load_model, read_test_views
 from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.sampling.edges import unit_float
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A view that a model is compared with."""
-
-    name: str
-    image: np.ndarray
-    """(H, W, 3|4) float32 in [0, 1], straight alpha."""
-    camera: Cameras
-    """The one that took it."""
-
-    def rays(self, device: torch.device) -> RayBundle:
-        """Its H * W rays."""
-        return self.camera.to(device, torch.float32).image_rays(0)
-
-
-def pictures_of(views: Views) -> list[Picture]:
-    """All views of a split."""
-    return [Picture(name, unit_float(views.images[i]), views.cameras[[i]]) for i, name in enumerate(views.names)]
-
-
-def get_background_color(model: RayModel) -> float:
-    """The grey level in [0, 1] of the background that a model is evaluated on."""
-    return model.config.background_level
-
-
-def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
-    """An output of all rays, on the CPU, without gradients and in evaluation mode."""
-    was_training = model.training
-    model.eval()
-    with torch.no_grad():
-        rendered = [model(rays[rows])[key].cpu() for rows in model.chunks(len(rays))]
-    model.train(was_training)
-    return torch.cat(rendered)
-
-
-def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
-    """A view's rendering (H, W, 3) in [0, 1] and its PSNR.
-
-    Raises:
-        FloatingPointError: the model renders values that are not finite.
-    """
-    height, width = picture.image.shape[:2]
-    rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
-    if not np.isfinite(rendered).all():
-        raise FloatingPointError("the model's colours are not finite: training diverged; try a lower --optimizer.lr")
-    error = (rendered.astype(np.float64) - composite_on(picture.image, get_background_color(model))) ** 2
-    return rendered, psnr(error.mean())
 
 
 def evaluate(
@@ -80,7 +33,7 @@ def evaluate(
     rows = []
     for i, picture in enumerate(pictures):
         rendered, _ = render_view(model, picture)
-        rows.append({"name": picture.name, **compute_metrics(rendered, picture.image, get_background_color(model))})
+        rows.append({"name": picture.name, **compute_metrics(rendered, picture.image, model.config.background_level)})
         if each is not None:
             each(i, picture, rendered)
     result: dict[str, Any] = {}
@@ -91,3 +44,35 @@ def evaluate(
     result["psnr_std"] = float(np.std([row["psnr"] for row in rows]))
     result["psnr_pooled"] = psnr(float(np.mean([row["mse"] for row in rows])))
     return result | {"lpips": None, "num_images": len(rows), "images": rows}
+
+
+def evaluate_run(
+    run: RunFolder, config: TrainerConfig, output_path: Path, render_output_path: Path | None
+) -> dict[str, Any]:
+    """Measure a run's last checkpoint on its held-out views and write nerfstudio's eval json.
+
+    Raises:
+        InputError: a bad run, or an output that cannot be written.
+    """
+    check_output(output_path)
+    model, checkpoint = load_model(run, config)
+    pictures = to_pictures(read_test_views(config))
+    if render_output_path is not None:
+        make_folder(render_output_path, "--render-output-path")
+
+    def report(i: int, picture: Picture, rendered: np.ndarray) -> None:
+        progress.update(i + 1)
+        if render_output_path is not None:
+            pair = np.concatenate((composite_on(picture.image, model.config.background_level), rendered), axis=1)
+            write_image(render_output_path / f"{i:04d}.png", pair)
+
+    with Progress(len(pictures), "evaluating") as progress:
+        results = evaluate(model, pictures, report)
+    content = {
+        "experiment_name": config.experiment_name,
+        "method_name": config.method_name,
+        "checkpoint": str(checkpoint),
+        "results": results,
+    }
+    write_json(output_path, content)
+    return results

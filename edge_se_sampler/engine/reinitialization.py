@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from edge_se_sampler.data.cameras import RayBundle
-from edge_se_sampler.engine.evaluation import render_rays
+from edge_se_sampler.engine.rendering import render_rays
 from edge_se_sampler.models.field import NeRFField
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.sampling.random_streams import Stream, stream

@@ -1,4 +1,4 @@
-"""The commands' work: train, resume, evaluate, from folders and settings to a trained, measured model."""
+"""From folders and settings to a trainer that is ready, or to a trained model."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import contextlib
 import ctypes
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from edge_se_sampler.data.blender import has_split, read_blender
+from edge_se_sampler.data.blender import Split, has_split, read_blender
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, pictures_of
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.engine.resolve import check_seconds, resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
-from edge_se_sampler.engine.trainer import Trainer, choose_device
+from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
 from edge_se_sampler.models.ray_model import RayModel
@@ -47,7 +49,7 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     """
     check_seconds(max_seconds)
     config = dataclasses.replace(config, max_seconds=max_seconds)
-    state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))  # before anything is built on it
+    state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     disable_malloc_trimming()
@@ -72,42 +74,50 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     return model, checkpoint
 
 
-def test_pictures(config: TrainerConfig) -> list[Picture]:
+def read_test_views(config: TrainerConfig) -> Views:
     """The held-out views of a run: its test split, or val where there is no test.
 
     Raises:
-        InputError: neither is there, or one of them is bad.
+        InputError: neither exists, or one of them is bad.
     """
     if config.data is None or not config.data.is_dir():
         raise InputError(f"{config.data}: no such folder, where this run's held-out views were")
-    for split in ("test", "val"):
-        if has_split(config.data, split):
-            pictures = pictures_of(read_blender(config.data, split))
-            if pictures:
-                return pictures
-    raise InputError(f"{config.data}: no held-out views; transforms_test.json or transforms_val.json is needed")
+    views = _read_first_split(config.data, ("test", "val"))
+    if views is None:
+        raise InputError(f"{config.data}: no held-out views; transforms_test.json or transforms_val.json is needed")
+    return views
 
 
-def read_views(config: TrainerConfig) -> Views:
-    """The training views of a config's data: all, or the few that it chooses.
+def _read_first_split(data: Path, splits: Sequence[Split]) -> Views | None:
+    """The first of the splits that has views."""
+    for split in splits:
+        if has_split(data, split):
+            views = read_blender(data, split)
+            if views.names:
+                return views
+    return None
+
+
+def read_train_views(config: TrainerConfig) -> Views:
+    """The training views of a config's data: all, or those of --num-views or --views.
 
     Raises:
-        InputError: no data given, bad data, or a choice of views that cannot be.
+        InputError: no data given, bad data, or a selection that does not fit it.
     """
     if config.data is None:
         raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
     views = read_blender(config.data, "train")
-    chosen = chosen_views(config, len(views.names))
-    return views if chosen is None else views.subset(chosen)
+    selected = select_views(config, len(views.names))
+    return views if selected is None else views.subset(selected)
 
 
-def chosen_views(config: TrainerConfig, count: int) -> list[int] | None:
-    """Numbers of the views to train on; None: all `count` of them.
+def select_views(config: TrainerConfig, count: int) -> list[int] | None:
+    """Indices of the views to train on; None: all `count` of them.
 
-    --num-views picks as InfoNeRF's public code does, numpy.random.RandomState(0).permutation(count)[:k].
+    --num-views selects as InfoNeRF's public code does, numpy.random.RandomState(0).permutation(count)[:k].
 
     Raises:
-        InputError: both choices at once, more views than there are, a number twice or out of range.
+        InputError: both flags, more views than there are, an index twice or out of range.
     """
     if config.num_views is not None:
         if config.views is not None:
@@ -149,15 +159,24 @@ def _samples(model: ModelConfig) -> str:
 
 
 def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
-    """Training views, and the first validation (or test) view to look at while training."""
-    views = read_views(config)
+    """Training views, and the first validation (or test) view for previews."""
+    views = read_train_views(config)
     assert config.data is not None
-    for split in ("val", "test"):
-        if has_split(config.data, split):
-            held_out = read_blender(config.data, split)
-            if held_out.names:
-                return views, pictures_of(held_out)[0]
-    return views, None
+    held_out = _read_first_split(config.data, ("val", "test"))
+    return views, None if held_out is None else to_pictures(held_out)[0]
+
+
+def choose_device(device_type: str) -> str:
+    """The torch device of --machine.device-type.
+
+    Raises:
+        InputError: cuda, where torch finds no GPU.
+    """
+    if device_type == "cuda" and not torch.cuda.is_available():
+        raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
+    if device_type == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return device_type
 
 
 def disable_malloc_trimming() -> None:

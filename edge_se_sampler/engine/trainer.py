@@ -16,13 +16,12 @@ from tqdm import tqdm
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, render_view
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
+from edge_se_sampler.engine.rendering import Picture, render_view
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.tensorboard import EventWriter
-from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
@@ -224,16 +223,3 @@ def create_adam(groups: list[tuple[list[torch.nn.Parameter], float]], config: Op
         except RuntimeError:  # before torch 2.4 a GPU's weights only
             pass
     return torch.optim.Adam(parts, eps=config.eps)
-
-
-def choose_device(device_type: str) -> str:
-    """The torch device for --machine.device-type.
-
-    Raises:
-        InputError: cuda is asked for and not there.
-    """
-    if device_type == "cuda" and not torch.cuda.is_available():
-        raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
-    if device_type == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return device_type

@@ -1,4 +1,4 @@
-"""Pictures -> a GIF or an MP4."""
+"""A run rendered as a GIF or an MP4."""
 
 from __future__ import annotations
 
@@ -6,9 +6,44 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import torch
 
+from edge_se_sampler.engine.camera_path import spiral
+from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, eight_bit, write_atomically
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import render_rays
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import load_model, read_test_views, read_train_views
 from edge_se_sampler.errors import InputError
+
+
+def render_run(
+    run: RunFolder, config: TrainerConfig, output_path: Path, kind: str, num_frames: int, frames_per_second: int
+) -> None:
+    """Render a run's last checkpoint along a spiral or at its held-out cameras, as a video.
+
+    Raises:
+        InputError: a bad run, or an output that cannot be written.
+    """
+    check_video(output_path, frames_per_second)
+    if num_frames < 1 or frames_per_second < 1:
+        raise InputError("--num-frames and --frames-per-second must be at least 1")
+    model, _ = load_model(run, config)
+    if kind == "spiral":
+        cameras = spiral(read_train_views(config).cameras, num_frames)
+    else:
+        cameras = read_test_views(config).cameras
+    (height, width), *others = torch.unique(torch.cat((cameras.height, cameras.width), dim=1), dim=0).tolist()
+    if others:
+        raise InputError("the held-out views differ in size and make no video; use --kind spiral")
+    cameras, frames = cameras.to(model.device, torch.float32), []
+    with Progress(len(cameras), "rendering") as progress:
+        for i in range(len(cameras)):
+            rendered = render_rays(model, cameras.image_rays(i))
+            frames.append(rendered.reshape(height, width, 3).numpy())
+            progress.update(i + 1)
+    write_video(output_path, frames, frames_per_second)
 
 
 def check_video(path: Path, frames_per_second: int) -> None:
@@ -31,7 +66,7 @@ def check_video(path: Path, frames_per_second: int) -> None:
 
 
 def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) -> None:
-    """Write (H, W, 3) float pictures in [0, 1]; a GIF's stand for whole hundredths of a second, the nearest number.
+    """Write (H, W, 3) float frames in [0, 1]; a GIF shows each for the nearest number of hundredths of a second.
 
     Raises:
         InputError: it cannot be written.
@@ -45,7 +80,7 @@ def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) ->
         return
     if min(stacked.shape[1:3]) < 2:
         raise InputError(f"{path}: the views are 1 pixel wide or high, which is no video")
-    even = stacked[:, : stacked.shape[1] // 2 * 2, : stacked.shape[2] // 2 * 2]  # what the codec takes
+    even = stacked[:, : stacked.shape[1] // 2 * 2, : stacked.shape[2] // 2 * 2]  # the codec needs even sides
     temporary = path.with_name(f".{path.stem}.tmp.mp4")
     try:
         iio.imwrite(temporary, even, fps=frames_per_second, macro_block_size=2)

@@ -33,8 +33,8 @@ from edge_se_sampler.bench.baselines.results import BaselineSettings
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
 from edge_se_sampler.bench.runner import Experiment, Run, load_or_create, pending, run_in_subprocess, write_result
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.engine.evaluation import pictures_of
 from edge_se_sampler.engine.metrics import compute_metrics
+from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.errors import InputError
 
 NEVER = str(10**9)
@@ -184,7 +184,7 @@ def _tensorf(task: Task, folder: Path, clock: Clock) -> None:
         return [0.0]
 
     program.evaluation = evaluate
-    downsampling = 800 / pictures_of(read_blender(task.data, "test"))[0].image.shape[1]
+    downsampling = 800 / to_pictures(read_blender(task.data, "test"))[0].image.shape[1]
     sys.argv = [
         "train.py", "--config", str(Path(str(program.__file__)).parent / "configs" / "lego.txt"),
         "--datadir", str(task.data), "--basedir", str(folder), "--downsample_train", str(downsampling),
@@ -225,7 +225,7 @@ PROGRAMS: dict[str, Callable[[Task, Path, Clock], None]] = {
 
 def mean_psnr(rendered: Sequence[np.ndarray], data: Path) -> float:
     """Of the test views (H, W, 3) in front of white, the mean over views."""
-    pictures = pictures_of(read_blender(data, "test"))
+    pictures = to_pictures(read_blender(data, "test"))
     rows = [
         compute_metrics(np.clip(image, 0, 1), picture.image, 1.0)
         for image, picture in zip(rendered, pictures, strict=True)

@@ -26,9 +26,10 @@ from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.overrides import override
 from edge_se_sampler.bench.runner import Run, run_in_subprocess
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
-from edge_se_sampler.engine.evaluation import Picture, evaluate, get_background_color, render_rays
+from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on, psnr
-from edge_se_sampler.engine.session import prepare, test_pictures
+from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
+from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.ray_model import RayModel
@@ -142,7 +143,7 @@ def _train_iterations(config: TrainerConfig, iterations: int, settings: ChartSet
 
 
 def _train(trainer: Trainer, ready: float, settings: ChartSettings) -> Run:
-    model, pictures = trainer.pipeline.model, test_pictures(trainer.config)
+    model, pictures = trainer.pipeline.model, to_pictures(read_test_views(trainer.config))
     counter = QueryCounter(model)
     due = [seconds for seconds in EVAL_SECONDS if ready < seconds < settings.seconds]
     curve, results, spent = [], {}, ready
@@ -159,7 +160,7 @@ def _train(trainer: Trainer, ready: float, settings: ChartSettings) -> Run:
             curve.append([round(spent, 3), step + 1, queries, round(results["psnr"], 3)])
         if last:
             break
-    outcome = measure_outcome(results, pictures, get_background_color(model))["outcome"]
+    outcome = measure_outcome(results, pictures, model.config.background_level)["outcome"]
     seconds, steps, queries, _ = curve[-1]
     run = {"psnr": results["psnr"], "outcome": outcome, "seconds": seconds, "steps": steps, "queries": queries}
     return {**run, "curve": curve}
@@ -170,7 +171,7 @@ def quick_psnr(model: RayModel, pictures: list[Picture]) -> float:
     rows, values = slice(None, None, PIXEL_STRIDE), []
     for picture in pictures:
         rendered = render_rays(model, picture.rays(model.device)[rows]).clamp(0, 1).double()
-        truth = torch.from_numpy(composite_on(picture.image, get_background_color(model))).reshape(-1, 3)[rows]
+        truth = torch.from_numpy(composite_on(picture.image, model.config.background_level)).reshape(-1, 3)[rows]
         values.append(psnr(float((rendered - truth).square().mean())))
     return statistics.mean(values)
 

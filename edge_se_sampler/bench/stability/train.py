@@ -19,11 +19,11 @@ from edge_se_sampler.bench.outcomes import Outcome, classify
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, override
 from edge_se_sampler.bench.stability.scenes import COLORS, NUM_TRAIN, background_of, render_splits
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Setting, Trial
-from edge_se_sampler.engine.evaluation import Picture, pictures_of, render_rays
 from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
+from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import disable_malloc_trimming
@@ -153,7 +153,7 @@ def build_trainer(
     datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=color)
     pipeline = Pipeline(datamanager, build_model(config, "cpu"))
     pipeline.model.background_fn = background_of(setting.background)
-    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), pictures_of(test)
+    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), to_pictures(test)
 
 
 def panel(model: NeRFModel, picture: Picture) -> np.ndarray:
