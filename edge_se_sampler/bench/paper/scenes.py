@@ -39,14 +39,8 @@ def real_scene(data: Path, scene: str, placement: str, workplace: Path) -> Path:
         return data / ANALOG_OF[scene]
     counterparts = workplace / "scenes" / "offcenter" / scene
     if not counterparts.exists():
-        progress = Progress(0, f"moving {scene} off the centre")
-
-        def update(done: int, total: int) -> None:
-            progress.total = total
-            progress.update(done)
-
-        offcenter(data / ANALOG_OF[scene], counterparts, progress=update)
-        progress.close()
+        with Progress(0, f"moving {scene} off the centre") as progress:
+            offcenter(data / ANALOG_OF[scene], counterparts, progress=progress.update)
     return counterparts / {"padded": "centered", "shifted": "shifted"}[placement]
 
 
