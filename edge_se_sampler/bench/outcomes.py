@@ -19,6 +19,10 @@ COLLAPSED_SHARE = 0.9
 """Share of the background's error on the object above which nothing of the object was learnt."""
 MIN_GAIN = 0.5
 """dB above the background alone, below which a training is underfit."""
+FAILURE_RULE = (
+    f"A training *failed* if it learnt nothing of the object (its error there is above {COLLAPSED_SHARE:.0%} of the "
+    f"plain background's) or ended less than {MIN_GAIN} dB above the background alone."
+)
 
 
 def classify(psnr: float, background_psnr: float, foreground_share: float) -> Outcome:

@@ -28,6 +28,16 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
     return f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; {versions}"
 
 
+def describe_command(result: Mapping[str, Any]) -> str:
+    """How to reproduce a result, what that takes, and where it was measured."""
+    hours = sum(run["cpu_seconds"] for run in result["runs"]) / 3600
+    return (
+        f"`{result['command']}` ({hours:.1f} CPU hours, shared by as many processes as there are cores); it resumes "
+        "where it was stopped. `edge-se bench report` with this folder writes the page and its pictures from "
+        f"result.json.\n\nMeasured on: {describe_machine(result['machine'])}."
+    )
+
+
 def fill_markers(path: Path, tables: Mapping[str, str]) -> None:
     """Replace what a text has between `<!-- table: NAME -->` and `<!-- end -->` by the tables of those names.
 

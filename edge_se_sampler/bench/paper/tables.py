@@ -14,7 +14,7 @@ from edge_se_sampler.bench.tables import markdown_table
 
 LEGEND = (
     "Test PSNR in dB: mean ± standard deviation over the seeds that all strategies of the table have; ✗1/3: 1 of 3 "
-    "runs failed. Small: the paper's number, on other data (bricks stands in for its Lego)."
+    "runs failed. Small: the paper's number, on other data (bricks stands in for its Lego). CPU s: of training, median."
 )
 
 
@@ -26,7 +26,7 @@ def psnr_tables(runs: list[Run]) -> list[str]:
 
 def psnr_table(number: int, runs: list[Run]) -> str:
     """A row for each strategy, a column for each scene."""
-    runs = select_common_seeds([run for run in runs if run["table"] == number])
+    runs = select_runs(runs, number)
     scenes = [scene for scene in SCENES if any(run["scene"] == scene for run in runs)]
     reference = published(number) if number in PAPER_TABLES else {}
     rows = []
@@ -38,13 +38,14 @@ def psnr_table(number: int, runs: list[Run]) -> str:
                 for scene in scenes
             ]
             average = statistics.mean(reference[strategy, scene] for scene in scenes) if reference else None
-            rows.append([label, *fields, _field(of_strategy, average)])
-    return markdown_table(["", *scenes, "mean"], rows)
+            seconds = statistics.median(run["cpu_seconds"] for run in of_strategy)
+            rows.append([label, *fields, _field(of_strategy, average), f"{seconds:.1f}"])
+    return markdown_table(["", *scenes, "mean", "CPU s"], rows)
 
 
 def summary_table(runs: list[Run]) -> str:
     """Mean PSNR and failures of every strategy in the paper's tables."""
-    selected = {n: select_common_seeds([run for run in runs if run["table"] == n]) for n in PAPER_TABLES}
+    selected = {number: select_runs(runs, number) for number in PAPER_TABLES}
     head = ["", *(table.title for table in PAPER_TABLES.values())]
     rows = [
         [label, *(_summarize([run for run in selected[n] if run["strategy"] == strategy]) for n in PAPER_TABLES)]
@@ -58,11 +59,12 @@ def count_failures(runs: Sequence[Run]) -> str:
     return f"{sum(map(failed, runs))} of {len(runs)} failed" if runs else "–"
 
 
-def select_common_seeds(runs: list[Run]) -> list[Run]:
-    """A table's runs of the seeds that all its strategies have; all runs, if there is no such seed.
+def select_runs(runs: list[Run], table: int) -> list[Run]:
+    """A table's runs of the seeds that all its strategies have; all its runs, if there is no such seed.
 
     Seeds that only some have were added for a verdict's sake: means over them would compare different seeds.
     """
+    runs = [run for run in runs if run["table"] == table]
     strategies = {run["strategy"] for run in runs}
     seeds = [{run["seed"] for run in runs if run["strategy"] == strategy} for strategy in strategies]
     return [run for run in runs if run["seed"] in set.intersection(*seeds)] or runs

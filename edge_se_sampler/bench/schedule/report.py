@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.outcomes import failed
+from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.paper.trials import TABLES
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.schedule.trials import CONFIGURATIONS, SHARES, best_shares, score_shares, selection_seeds
 from edge_se_sampler.bench.statistics import PairedDifference, format_difference, paired_difference, wilson_interval
-from edge_se_sampler.bench.tables import describe_machine, markdown_table
+from edge_se_sampler.bench.tables import describe_command, markdown_table
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 
 MARGIN = 0.2
@@ -72,16 +72,7 @@ def describe(folder: Path) -> str:
     parts = [QUESTION, *_describe_failures(runs), *_describe_lengths(compare_lengths(runs))]
     if (folder / "lengths.png").exists():
         parts.append("![PSNR by fixed share, and the adaptive schedule against the best one](lengths.png)")
-    failures, lengths = (
-        sum(run["cpu_seconds"] for run in runs if run["part"] == part) / 3600 for part in ("failures", "lengths")
-    )
-    parts.append(
-        f"## Reproduce\n\n`{result['command']}`: {failures:.1f} CPU hours for the test of failures, "
-        f"{lengths:.1f} for that of lengths (`--parts`), shared by as many processes as there are cores; it "
-        "resumes where it was stopped. `edge-se bench report` with the folder writes this page and the picture from "
-        f"result.json.\n\nMeasured on: {describe_machine(result['machine'])}."
-    )
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join([*parts, "## Reproduce", describe_command(result)]) + "\n"
 
 
 def tables(folder: Path) -> dict[str, str]:
@@ -140,12 +131,10 @@ def _describe_failures(runs: list[Run]) -> list[str]:
         rows.append(row)
     return [
         "## Failures",
-        f"Each training is paired with one that draws its pixels uniformly (Random) from the same initial weights: "
-        f"{len(pairs)} pairs, {trained[0]['iterations']} iterations. A training *failed* if it learnt nothing of the "
-        "object (its error there is above 90 % of the plain background's) or ended less than 0.5 dB above the "
-        f"background alone. Of {len(pairs)} pairs Random failed in {random}, the adaptive schedule in {adaptive} (95 % "
-        f"Wilson interval of its failure rate: {low:.1f} to {high:.1f} %); in {reinitialized} trainings a dead network "
-        "was reinitialised. Failures of Random / of the adaptive schedule:",
+        f"Each training is paired with one that draws its pixels uniformly (Random) from the same initial weights, "
+        f"{trained[0]['iterations']} iterations. {FAILURE_RULE} Of {len(pairs)} pairs Random failed in {random}, the "
+        f"adaptive schedule in {adaptive} (95 % Wilson interval of its failure rate: {low:.1f} to {high:.1f} %); in "
+        f"{reinitialized} trainings a dead network was reinitialised. Failures of Random / of the adaptive schedule:",
         markdown_table(["", *SCENES], rows),
     ]
 
