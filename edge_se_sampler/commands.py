@@ -11,7 +11,7 @@ import tyro
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs, registered_methods
-from edge_se_sampler.models.config import LeanModelConfig, check_fineness
+from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
@@ -229,7 +229,6 @@ class Inspect:
         config = LeanModelConfig(
             near=self.near, far=self.far, voxel_size_px=self.voxel_size_px, step_size_voxels=self.step_size_voxels
         )
-        check_fineness(config)
         print(inspect(read_blender(self.data, "train"), config, self.output_path))
         print(self.output_path)
 

@@ -23,3 +23,16 @@ def check_known(flag: str, chosen: Sequence[object], known: Iterable[object]) ->
     for name in chosen:
         if name not in known:
             raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
+
+
+def check_value(flag: str, value: object, valid: bool, rule: str) -> None:
+    """Refuse a flag's value.
+
+    Args:
+        rule: what it must be, for the message.
+
+    Raises:
+        InputError: it is not valid.
+    """
+    if not valid:
+        raise InputError(f"--{flag} is {value}: must be {rule}")

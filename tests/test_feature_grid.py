@@ -17,7 +17,7 @@ SIDE = 0.5
 
 
 def grid(shown: np.ndarray) -> OccupancyGrid:
-    return OccupancyGrid.of(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown)).double()
+    return OccupancyGrid.from_hull(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown)).double()
 
 
 def inside(shown: np.ndarray, count: int = 300) -> torch.Tensor:
@@ -52,7 +52,7 @@ def test_what_is_linear_is_exact_in_between() -> None:
     slope, offset = torch.from_numpy(rng.normal(size=(3, 4))), torch.from_numpy(rng.normal(size=4))
     corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
     with torch.no_grad():
-        positions = cells.corner + (features.low[:, None] + corners) * SIDE
+        positions = cells.aabb_min + (features.cell_origin[:, None] + corners) * SIDE
         features.table[features.rows] = positions @ slope + offset
     points = inside(shown)
     torch.testing.assert_close(features_at(features, points), points @ slope + offset)
@@ -97,33 +97,35 @@ def random_features(cells: OccupancyGrid) -> FeatureGrid:
     return features
 
 
-def split_some(shown: np.ndarray, splits: int = 1) -> tuple[FeatureGrid, torch.Tensor]:
+def split_some(shown: np.ndarray, max_level: int = 1) -> tuple[FeatureGrid, torch.Tensor]:
     """Cells of which about half are split so often, and which of today's were."""
-    cells = OccupancyGrid.of(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown), splits).double()
+    cells = OccupancyGrid.from_hull(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown), max_level).double()
     features = random_features(cells)
-    owned = cells.possible & (torch.rand(cells.possible.shape, generator=torch.Generator().manual_seed(1)) < 0.5)
-    for _ in range(splits):
-        owned = upsample(owned)
-        features.own(owned)
-    return features, owned
+    refined = cells.static_mask & (
+        torch.rand(cells.static_mask.shape, generator=torch.Generator().manual_seed(1)) < 0.5
+    )
+    for _ in range(max_level):
+        refined = upsample(refined)
+        features.refine(refined)
+    return features, refined
 
 
-@pytest.mark.parametrize("splits", [1, 2])
-def test_a_split_changes_no_feature(splits: int) -> None:
+@pytest.mark.parametrize("max_level", [1, 2])
+def test_a_split_changes_no_feature(max_level: int) -> None:
     shown, points = some_cells(), inside(some_cells())
-    features, owned = split_some(shown, splits)
+    features, refined = split_some(shown, max_level)
     before = random_features(grid(shown))
     (cells,) = features.grid
-    assert float(cells.side) == SIDE / 2**splits
-    assert 0.2 < owned.reshape(-1)[cells.locate(points)].double().mean() < 0.8
+    assert float(cells.cell_size) == SIDE / 2**max_level
+    assert 0.2 < refined.reshape(-1)[cells.locate(points)].double().mean() < 0.8
     torch.testing.assert_close(features_at(features, points), features_at(before, points))
 
 
 def test_split_cells_have_corners_of_their_own_and_others_the_first_ones() -> None:
-    features, owned = split_some(some_cells())
+    features, refined = split_some(some_cells())
     before, points = random_features(grid(some_cells())), inside(some_cells())
     (cells,) = features.grid
-    inner = owned.reshape(-1)[cells.locate(points)]
+    inner = refined.reshape(-1)[cells.locate(points)]
     with torch.no_grad():
         features.table[len(before.table) :] += 1
     after = features_at(features, points) - features_at(before, points)
@@ -141,21 +143,21 @@ def test_corners_of_split_cells_are_stored_once() -> None:
     features, _ = split_some(one, 0)
     (cells,) = features.grid
     assert len(features.table) == 8
-    cells.splits[1] = 1
-    features.own(upsample(cells.possible))
+    cells.max_level.fill_(1)
+    features.refine(upsample(cells.static_mask))
     assert len(features.table) == 8 + 27
 
 
 def test_cells_that_join_later_begin_with_what_is_known_there() -> None:
-    features, owned = split_some(some_cells())
+    features, refined = split_some(some_cells())
     with torch.no_grad():  # the levels have gone apart
         features.table.normal_(generator=torch.Generator().manual_seed(2))
     (cells,) = features.grid
     points = inside(some_cells())
-    apart = ~F.max_pool3d(owned.double()[None, None], 3, 1, 1)[0, 0].bool().reshape(-1)[cells.locate(points)]
-    inner = owned.reshape(-1)[cells.locate(points)]
+    apart = ~F.max_pool3d(refined.double()[None, None], 3, 1, 1)[0, 0].bool().reshape(-1)[cells.locate(points)]
+    inner = refined.reshape(-1)[cells.locate(points)]
     before, rows = features_at(features, points), len(features.table)
-    features.own(cells.possible.clone())
+    features.refine(cells.static_mask.clone())
     assert len(features.table) > rows
     assert int(apart.sum()) > 5
     after = features_at(features, points)

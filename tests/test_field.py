@@ -11,11 +11,11 @@ import torch
 from tiny import tiny_config
 from torch import Tensor, nn
 
-from edge_se_sampler.models.config import SIZES, NeRFModelConfig, apply_preset
+from edge_se_sampler.models.config import NeRFModelConfig, apply_preset
 from edge_se_sampler.models.field import NeRFField
 from edge_se_sampler.models.nerf import NeRFModel
 
-PAPER = SIZES["paper"].model
+PAPER = apply_preset(NeRFModelConfig("paper"), 1024)
 
 
 def make(seed: int = 0, **changes: Any) -> NeRFField:
@@ -165,7 +165,7 @@ def test_xavier_bounds_and_zero_biases() -> None:
 
 def test_torchs_default_bounds() -> None:
     """Weight and bias uniform in +-1 / sqrt(in), as nn.Linear's own."""
-    config = apply_preset(NeRFModelConfig(initialization="torch"), "paper", 1024)
+    config = apply_preset(NeRFModelConfig("paper", initialization="torch"), 1024)
     for layer in linear_layers(NeRFField(config, np.random.default_rng(0))):
         bound = 1 / math.sqrt(layer.in_features)
         check_uniform(layer.weight, bound)

@@ -14,6 +14,7 @@ import torch
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.synthetic.cameras import poses
 from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.occupancy import hull as hull_module
@@ -31,7 +32,7 @@ from edge_se_sampler.occupancy.hull import (
     projected,
     silhouettes,
 )  # fmt: skip
-from edge_se_sampler.occupancy.scene_analysis import MAX_GRID_CELLS, analyze_scene, live_pixels, spread_pixels
+from edge_se_sampler.occupancy.scene_analysis import MAX_GRID_CELLS, live_pixels, spread_pixels
 
 VIEWS = 12
 
@@ -92,7 +93,7 @@ def hull_of(views: Views, voxel_size_px: float = 1.6) -> Hull:
 
 def missed(views: Views, hull: Hull) -> int:
     """Foreground pixels whose ray meets no cell of the hull."""
-    grid, cameras = OccupancyGrid.of(hull), views.cameras.to(dtype=torch.float32)
+    grid, cameras = OccupancyGrid.from_hull(hull), views.cameras.to(dtype=torch.float32)
     pixels = np.concatenate(
         [np.insert(np.argwhere(image[..., 3] > 0), 0, i, axis=1) for i, image in enumerate(views.images)]
     )
@@ -255,7 +256,7 @@ def test_what_an_image_cuts_off_is_kept() -> None:
     views = views_of(points, focal=2.2)
     assert not any(shape.whole for shape in silhouettes(views).values())
     hull = hull_of(views)
-    kept = OccupancyGrid.of(hull).contains(torch.from_numpy(points).float()).numpy()
+    kept = OccupancyGrid.from_hull(hull).contains(torch.from_numpy(points).float()).numpy()
     seen = np.zeros(len(points), dtype=bool)
     for number in range(VIEWS):
         low, high, _ = projected(views.cameras, number, points, 1e-6)
@@ -274,14 +275,14 @@ def test_without_a_background_all_that_views_see_is_kept(opaque: bool) -> None:
     views = views_of(rods())
     images = tuple(image[..., :3] if opaque else np.full_like(image, 255) for image in views.images)
     plain = replace(views, images=images)
-    told = analyze_scene(plain, LeanModelConfig())
-    assert told.silhouettes == 0
-    middle = told.hull.corner + np.array(told.hull.cells.shape) * told.hull.side / 2
-    np.testing.assert_allclose(middle, 0, atol=told.hull.side)
-    grid = OccupancyGrid.of(told.hull)
+    analysis = analyze_views(plain, LeanModelConfig())
+    assert analysis.silhouettes == 0
+    middle = analysis.hull.corner + np.array(analysis.hull.cells.shape) * analysis.hull.side / 2
+    np.testing.assert_allclose(middle, 0, atol=analysis.hull.side)
+    grid = OccupancyGrid.from_hull(analysis.hull)
     rng = np.random.default_rng(0)
     assert bool(grid.contains(torch.from_numpy(rng.uniform(-1, 1, (1000, 3))).float()).all())
-    assert told.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS
+    assert analysis.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS
 
 
 def test_a_cell_behind_a_camera_is_not_seen_by_it() -> None:
@@ -300,9 +301,9 @@ def test_a_sparse_scene_has_no_grid_without_bounds(monkeypatch: pytest.MonkeyPat
     """Two specks far apart: few cells, but a box around them that grids keep numbers for."""
     specks = rods()[-2000:] * 0.02
     views = views_of(np.concatenate((specks + 0.8, specks - 0.8)), 400)
-    free = analyze_scene(views, LeanModelConfig(voxel_size_px=0.7)).hull
+    free = analyze_views(views, LeanModelConfig(voxel_size_px=0.7)).hull
     monkeypatch.setattr(economy, "MAX_GRID_CELLS", 2**18)
-    bound = analyze_scene(views, LeanModelConfig(voxel_size_px=0.7)).hull
+    bound = analyze_views(views, LeanModelConfig(voxel_size_px=0.7)).hull
     assert free.cells.size > 2**20
     assert bound.cells.size <= 1.2 * 2**18
     assert missed(views, bound) == 0
@@ -312,16 +313,16 @@ def test_cameras_that_see_nothing_are_refused_in_one_line() -> None:
     views = views_of(rods())
     aside = with_cameras(views, cx=views.cameras.cx + 4000, cy=views.cameras.cy + 4000)
     with pytest.raises(InputError, match=r"no training view sees anything.*principal points"):
-        analyze_scene(aside, LeanModelConfig())
+        analyze_views(aside, LeanModelConfig())
 
 
 def test_a_part_that_is_off_does_not_carve() -> None:
     views = views_of(rods())
-    carved, whole = (analyze_scene(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
+    carved, whole = (analyze_views(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
     assert carved.silhouettes == VIEWS
     assert whole.silhouettes == 0
     assert carved.hull.cells.sum() * carved.hull.side**3 < 0.02 * whole.hull.cells.sum() * whole.hull.side**3
-    assert analyze_scene(views, LeanModelConfig(empty_space_skipping=False)).silhouettes == 0
+    assert analyze_views(views, LeanModelConfig(empty_space_skipping=False)).silhouettes == 0
 
 
 @pytest.mark.parametrize("apart", [0, 30])
@@ -332,40 +333,40 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
     def moved(i: int, alpha: np.ndarray) -> np.ndarray:
         return np.roll(alpha, (apart * (-1) ** i, apart * (-1) ** (i // 2)), axis=(0, 1))
 
-    told = analyze_scene(with_masks(views, moved), LeanModelConfig())
-    assert (told.silhouettes == 0) == bool(apart)
+    analysis = analyze_views(with_masks(views, moved), LeanModelConfig())
+    assert (analysis.silhouettes == 0) == bool(apart)
     assert capfd.readouterr().err.count("do not agree") == bool(apart)
-    assert missed(views, told.hull) == 0
+    assert missed(views, analysis.hull) == 0
 
 
 def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:
     views = views_of(rods())
-    fine = analyze_scene(views, LeanModelConfig(voxel_size_px=1.6))
+    fine = analyze_views(views, LeanModelConfig(voxel_size_px=1.6))
     assert fine.hull.side == pytest.approx(1.6 * fine.footprint)
-    many = analyze_scene(views_of(rods(), 800, 4), LeanModelConfig(voxel_size_px=0.2))
+    many = analyze_views(views_of(rods(), 800, 4), LeanModelConfig(voxel_size_px=0.2))
     assert many.hull.side > 0.2 * many.footprint
     assert 0.05 * MAX_OCCUPIED_CELLS < many.hull.cells.sum() < MAX_OCCUPIED_CELLS
 
 
-@pytest.mark.parametrize(("size", "splits"), [(100, 2), (800, 2), (20, 0)])
-def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int, splits: int) -> None:
+@pytest.mark.parametrize(("size", "max_level"), [(100, 2), (800, 2), (20, 0)])
+def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int, max_level: int) -> None:
     views = views_of(rods(), size, 4)
-    told = analyze_scene(views, LeanModelConfig(cull_by_alpha=False))
-    assert told.splits == splits
-    assert told.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS / 8
-    assert told.hull.cells.size * 8**told.splits < MAX_GRID_CELLS
+    analysis = analyze_views(views, LeanModelConfig(cull_by_alpha=False))
+    assert analysis.max_level == max_level
+    assert analysis.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS / 8
+    assert analysis.hull.cells.size * 8**analysis.max_level < MAX_GRID_CELLS
     if size == 100:  # as near as halving comes to what a pixel asks
-        assert 2**-0.5 < told.hull.side / 2**splits / told.footprint < 2**0.5
+        assert 2**-0.5 < analysis.hull.side / 2**max_level / analysis.footprint < 2**0.5
     for settled in (
-        analyze_scene(views, LeanModelConfig(cull_by_density=False)),
-        analyze_scene(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
-        analyze_scene(views, LeanModelConfig(empty_space_skipping=False)),
-        analyze_scene(views, NeRFModelConfig(empty_space_skipping=True)),
+        analyze_views(views, LeanModelConfig(cull_by_density=False)),
+        analyze_views(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
+        analyze_views(views, LeanModelConfig(empty_space_skipping=False)),
+        analyze_views(views, NeRFModelConfig(empty_space_skipping=True)),
     ):
-        assert (settled.splits, settled.coarser) == (0, 0)
-    carved = analyze_scene(views, LeanModelConfig())
-    assert (carved.splits, carved.coarser) == (1, 1)
-    assert float(carved.grid().side) == pytest.approx(2 * carved.hull.side)
+        assert (settled.max_level, settled.coarsening) == (0, 0)
+    carved = analyze_views(views, LeanModelConfig())
+    assert (carved.max_level, carved.coarsening) == (1, 1)
+    assert float(carved.grid().cell_size) == pytest.approx(2 * carved.hull.side)
 
 
 # -- live pixels
@@ -374,7 +375,7 @@ def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int,
 def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
     views = views_of(rods())
     hull = hull_of(views)
-    grid, cameras = OccupancyGrid.of(hull), views.cameras.to(dtype=torch.float32)
+    grid, cameras = OccupancyGrid.from_hull(hull), views.cameras.to(dtype=torch.float32)
     dead = 0
     for number, live in enumerate(live_pixels(views, hull)):
         rays = cameras.image_rays(number)

@@ -11,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from tiny import cells, check_gradients, judged, tiny_model, tiny_rays
+from tiny import cells, check_gradients, occupied_after, tiny_model, tiny_rays
 from torch import Tensor
 
 from edge_se_sampler.bench.overrides import SAMPLER, override
@@ -19,8 +19,9 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.inspection import inspect
+from edge_se_sampler.engine.pipeline import analyze_views, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import render_rays, render_view, to_pictures
-from edge_se_sampler.engine.session import describe_run, load_model, prepare
+from edge_se_sampler.engine.session import describe_run, load_model, prepare, prepare_resume
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import lean
@@ -28,7 +29,7 @@ from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import UPDATE_INTERVAL, LeanModel
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.hull import Hull
-from edge_se_sampler.occupancy.scene_analysis import analyze_scene, live_pixels
+from edge_se_sampler.occupancy.scene_analysis import live_pixels
 
 RAYS = 12
 JUDGE_FROM = 2 * UPDATE_INTERVAL
@@ -45,13 +46,21 @@ def ball(radius: float = 1.0) -> Hull:
 def model_in(hull: Hull, **changes: Any) -> LeanModel:
     """A tiny one in float64, its features not all 0."""
     config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), **changes)
-    model = LeanModel(config, np.random.default_rng(0))
-    model.settle(OccupancyGrid.of(hull))
-    model = model.double()
+    model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(hull)).double()
     assert model.features is not None
     with torch.no_grad():
         model.features.table.copy_(torch.from_numpy(np.random.default_rng(1).normal(size=model.features.table.shape)))
     return model
+
+
+def reloaded(model: LeanModel) -> LeanModel:
+    """Another model from its state."""
+    state = model.state_dict()
+    grid = saved_grid(state)
+    assert grid is not None
+    other = LeanModel(model.config, np.random.default_rng(5), grid).to(model.dtype)
+    load_weights(other, state)
+    return other
 
 
 def pixels() -> Tensor:
@@ -68,7 +77,7 @@ def test_gradients_of_everything_against_finite_differences() -> None:
     check_gradients(model, lambda: loss_of(model))
 
 
-def test_culled_rendering_equals_rendering_everything_with_nothing_outside(
+def test_culled_rendering_equals_dense_rendering_of_zeros_outside(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The same samples in a box that is wholly occupied, their density set to 0 outside of the ball."""
@@ -81,20 +90,20 @@ def test_culled_rendering_equals_rendering_everything_with_nothing_outside(
     assert other is not None
     with torch.no_grad():
         shape = cells(whole).occupied.shape
-        number = other.number[np.ravel_multi_index(one.low.long().T.numpy(), shape)]
+        number = other.cell_to_row[np.ravel_multi_index(one.cell_origin.long().T.numpy(), shape)]
         other.table[other.rows[number.long()]] = one.table[one.rows]
     inside = cells(culled).contains
     field = whole.fine.forward
 
     def masked(positions: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
         raw, color = field(positions, *others)
-        world = positions * cells(whole).reach + cells(whole).middle
+        world = positions * cells(whole).half_extent + cells(whole).center
         return torch.where(inside(world), raw, -torch.inf), color
 
     monkeypatch.setattr(whole.fine, "forward", masked)
     rays = tiny_rays(RAYS)
     # both march from where the same box begins
-    cells(whole).corner.copy_(cells(culled).corner)
+    cells(whole).aabb_min.copy_(cells(culled).aabb_min)
     shown, expected = culled(rays), whole(rays)
     assert 0.01 < float(shown["accumulation_fine"].detach().mean()) < 0.99
     for key in ("rgb_fine", "accumulation_fine", "depth_fine"):
@@ -119,12 +128,12 @@ def test_empty_cells_go_and_some_are_tried_again(monkeypatch: pytest.MonkeyPatch
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert judged(model, JUDGE_FROM - UPDATE_INTERVAL) == before  # too early
-    assert judged(model, JUDGE_FROM + 1) == before  # not the time
-    first = judged(model, JUDGE_FROM)
+    assert occupied_after(model, JUDGE_FROM - UPDATE_INTERVAL) == before  # too early
+    assert occupied_after(model, JUDGE_FROM + 1) == before  # not the time
+    first = occupied_after(model, JUDGE_FROM)
     assert 0 < first < 0.1 * before  # a fiftieth on average
     again = cells(model).occupied.clone()
-    judged(model, JUDGE_FROM + UPDATE_INTERVAL)
+    occupied_after(model, JUDGE_FROM + UPDATE_INTERVAL)
     assert not torch.equal(again, cells(model).occupied)  # others
 
 
@@ -132,8 +141,8 @@ def test_what_was_seen_before_densities_mean_something_does_not_count() -> None:
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(2000), {"image": torch.ones(2000, 3).double()})
-    assert judged(model, UPDATE_INTERVAL) == before
-    assert judged(model, JUDGE_FROM) < 0.1 * before  # nothing was seen since
+    assert occupied_after(model, UPDATE_INTERVAL) == before
+    assert occupied_after(model, JUDGE_FROM) < 0.1 * before  # nothing was seen since
 
 
 def test_a_dense_cell_stays() -> None:
@@ -142,13 +151,12 @@ def test_a_dense_cell_stays() -> None:
     for seed in range(3):
         rays = tiny_rays(2000, seed)
         model.training_loss(rays, {"image": torch.ones(2000, 3).double()})
-    assert judged(model, JUDGE_FROM) > 0.95 * before
+    assert occupied_after(model, JUDGE_FROM) > 0.95 * before
 
 
 def test_without_features_there_is_the_network_alone() -> None:
     config = LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=0)
-    model = LeanModel(config, np.random.default_rng(0))
-    model.settle(OccupancyGrid.of(ball()))
+    model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(ball()))
     ((weights, rate),) = model.parameter_groups()
     assert rate == 1
     assert len(weights) == len(list(model.fine.parameters())) == len(list(model.parameters()))
@@ -162,8 +170,8 @@ def test_a_part_that_is_off_judges_nothing(off: dict[str, Any], monkeypatch: pyt
     model = model_in(ball(), **off).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert not bool(cells(model).largest.any())
-    assert judged(model, JUDGE_FROM) == before
+    assert not bool(cells(model).max_density.any())
+    assert occupied_after(model, JUDGE_FROM) == before
 
 
 def test_judgements_are_a_function_of_the_seed() -> None:
@@ -181,55 +189,68 @@ def test_judgements_are_a_function_of_the_seed() -> None:
 def test_a_box_of_which_nothing_is_known_can_be_seen_through_at_first(count: int) -> None:
     size = 3.0
     cube = Hull(np.full(3, -size / 2), size / count, np.ones((count, count, count), dtype=bool))
-    model = LeanModel(LeanModelConfig("tiny", 32, 1, 4, 2), np.random.default_rng(0))
-    fog = LeanModel(LeanModelConfig("tiny", 32, 1, 4, 2), np.random.default_rng(0))
+    config = LeanModelConfig("tiny", 32, 1, 4, 2)
+    model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(cube))
     cube.cells[: count // 2] = False  # carved
-    fog.settle(OccupancyGrid.of(cube))
-    cube.cells[:] = True
-    model.settle(OccupancyGrid.of(cube))
+    fog = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(cube))
     rays = tiny_rays(RAYS, dtype=torch.float32)
     met = model.eval()(rays)["accumulation_fine"]
     assert 0.3 < float(met.detach().max()) < 0.9
     assert float(fog.eval()(rays)["accumulation_fine"].detach().max()) > 0.8
-    again = LeanModel(LeanModelConfig("tiny", 32, 1, 4, 2), np.random.default_rng(1))
-    again.load_state_dict(model.state_dict())
-    assert torch.equal(again.eval()(rays)["accumulation_fine"], met)
+    assert torch.equal(reloaded(model).eval()(rays)["accumulation_fine"], met)
 
 
 def test_a_state_brings_its_cells() -> None:
     model = model_in(ball())
     cells(model).occupied[3] = False
-    fresh = LeanModel(model.config, np.random.default_rng(5)).double()
-    fresh.load_state_dict(model.state_dict())
+    fresh = reloaded(model)
     rays = tiny_rays(RAYS)
     assert torch.equal(fresh.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
     assert torch.equal(cells(fresh).occupied, cells(model).occupied)
 
 
-def test_a_state_of_other_cells_is_refused() -> None:
+def test_grids_of_other_scenes_are_told_apart() -> None:
     """As many corners, elsewhere: features would be read at the wrong ones without a word."""
     model, mirrored = model_in(ball()), ball()
     one = model_in(replace(mirrored, corner=mirrored.corner + 1e-3))
     mirrored.cells[0] = False
     mirrored.cells[0, 4, 4] = True
     for other in (one, model_in(mirrored)):
-        before = {key: value.clone() for key, value in other.state_dict().items()}
-        with pytest.raises(InputError, match="cells are not the checkpoint's"):
-            other.load_state_dict(model.state_dict())
-        assert all(torch.equal(value, before[key]) for key, value in other.state_dict().items())
+        assert not model.grid.is_of_the_same_scene(other.grid)
+    assert model.grid.is_of_the_same_scene(model_in(ball()).grid)
+
+
+def test_a_run_is_not_resumed_on_a_scene_that_has_changed(larger: Path, tmp_path: Path) -> None:
+    config = replace(lean_config(larger, tmp_path), max_num_iterations=1)
+    trainer = prepare(config)
+    trainer.train()
+    image = next(path for path in sorted(larger.rglob("*.png")) if "train" in str(path))
+    changed_pixels = iio.imread(image)
+    changed_pixels[:12] = 255
+    iio.imwrite(image, changed_pixels)
+    with pytest.raises(InputError, match="cells are not the checkpoint's"):
+        prepare_resume(trainer.run, trainer.config)
+
+
+def test_weights_of_another_model_are_refused() -> None:
+    with pytest.raises(InputError, match="not this model's"):
+        load_weights(model_in(ball(), feature_dim=2), model_in(ball()).state_dict())
+    with pytest.raises(InputError, match="another version"):
+        saved_grid({"grid.corner": torch.zeros(3)})
 
 
 def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() -> None:
-    dense, settled = (tiny_model(density_activation="softplus").eval() for _ in range(2))
-    settled.settle(OccupancyGrid.of(Hull(np.full(3, -9.0), 1.0, np.ones((18, 18, 18), dtype=bool))))
+    everything, middle = (
+        OccupancyGrid.from_hull(Hull(np.full(3, -half), size, np.ones((count,) * 3, dtype=bool)))
+        for half, size, count in ((9.0, 1.0, 18), (0.3, 0.2, 3))
+    )
+    dense, whole, part = (
+        tiny_model(grid=grid, density_activation="softplus").eval() for grid in (None, everything, middle)
+    )
     rays = tiny_rays(RAYS)
     for key, value in dense(rays).items():
-        torch.testing.assert_close(settled(rays)[key], value, rtol=0, atol=1e-12)
-    fresh = tiny_model(seed=4, density_activation="softplus").eval()
-    fresh.load_state_dict(settled.state_dict())
-    assert torch.equal(fresh(rays)["rgb_fine"], settled(rays)["rgb_fine"])
-    settled.settle(OccupancyGrid.of(Hull(np.full(3, -0.3), 0.2, np.ones((3, 3, 3), dtype=bool))))
-    assert float((settled(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).detach().abs().max()) > 1e-3
+        torch.testing.assert_close(whole(rays)[key], value, rtol=0, atol=1e-12)
+    assert float((part(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).detach().abs().max()) > 1e-3
 
 
 # -- from files
@@ -269,9 +290,11 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
 
 def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
-    told = analyze_scene(read_blender(larger, "train"), trainer.config.pipeline.model)
-    assert (told.splits, told.silhouettes) == (1, 0)
-    assert cells(trainer.pipeline.model).is_the_same_as(OccupancyGrid.of(told.hull, told.splits))
+    analysis = analyze_views(read_blender(larger, "train"), trainer.config.pipeline.model)
+    assert (analysis.max_level, analysis.silhouettes) == (1, 0)
+    assert cells(trainer.pipeline.model).is_of_the_same_scene(
+        OccupancyGrid.from_hull(analysis.hull, analysis.max_level)
+    )
     views = trainer.pipeline.datamanager
     assert "mask" not in views.image_batch
     loss = [trainer.train_iteration(step) for step in range(3)]
@@ -325,23 +348,25 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     answer = edge_se("inspect", "--data", larger, "--output-path", tmp_path / "inspect.png")
     assert answer.code == 0, answer
     said = dict(line.split(maxsplit=1) for line in answer.out.splitlines()[:-1])
-    told = analyze_scene(read_blender(larger, "train"), LeanModelConfig())
-    assert f"{told.hull.cells.sum():,} of" in said["cells"]
+    analysis = analyze_views(read_blender(larger, "train"), LeanModelConfig())
+    assert f"{analysis.hull.cells.sum():,} of" in said["cells"]
     assert said["silhouettes"].startswith("6 of 6 views")
-    assert said["pixel"].startswith(f"{told.footprint:.4f}")
-    live = live_pixels(read_blender(larger, "train"), told.hull)
+    assert said["pixel"].startswith(f"{analysis.footprint:.4f}")
+    live = live_pixels(read_blender(larger, "train"), analysis.hull)
     assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
     assert said["sampling"].startswith("uniform")
-    wave = 2 * np.pi * float(told.grid().reach) / 2**5 / told.footprint
+    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.footprint
     assert wave > 2  # pixels: no more than the cameras resolve
     assert said["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
     assert said["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
-    large = analyze_scene(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
+    large = analyze_views(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
     assert f"training begins with {large.hull.side:.4f}, split to {large.hull.side / 2:.4f} where" in unlocated
-    assert f"training begins with {2 * told.hull.side:.4f}, split to {told.hull.side:.4f} where" in said["cells"]
+    assert (
+        f"training begins with {2 * analysis.hull.side:.4f}, split to {analysis.hull.side:.4f} where" in said["cells"]
+    )
     whole = large.hull.cells
     assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
     for flag, value in (

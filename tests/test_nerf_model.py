@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
+from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.hull import Hull
 
 RAYS = 9
 OUTPUTS = ("rgb_coarse", "rgb_fine", "accumulation_coarse", "accumulation_fine", "depth_fine")
@@ -68,7 +70,7 @@ def test_importance_samples_go_where_the_coarse_network_has_seen_something(monke
     model, rays = tiny_model(num_coarse_samples=17, num_importance_samples=200).eval(), tiny_rays(RAYS)
     rays.metadata["directions_norm"].fill_(1)
 
-    def shell(positions: Tensor, directions: Tensor, ray: None, noise: None) -> tuple[Tensor, Tensor]:
+    def shell(positions: Tensor, directions: Tensor, ray_indices: None, noise: None) -> tuple[Tensor, Tensor]:
         t = distances(positions, rays).reshape(-1)
         return 100.0 * ((t > 3.2) & (t < 3.3)).double(), torch.zeros_like(positions)
 
@@ -237,10 +239,10 @@ def hold_importance(model: NeRFModel) -> None:
     model._importance = first
 
 
-@pytest.mark.parametrize("occupied", [None, lambda positions: positions.norm(dim=1) < 1.5])
-def test_gradients_of_every_layer_against_finite_differences(occupied: Any) -> None:
-    model = tiny_model(density_activation="softplus", density_noise=0.2, background_color="random").train()
-    model.occupied = occupied
+@pytest.mark.parametrize("culled", [False, True])
+def test_gradients_of_every_layer_against_finite_differences(culled: bool) -> None:
+    grid = ball_grid(1.5) if culled else None
+    model = tiny_model(grid=grid, density_activation="softplus", density_noise=0.2, background_color="random").train()
     hold_importance(model)
     batch = {"image": pixels(), "weight": torch.linspace(0.5, 2, RAYS, dtype=torch.float64)}
 
@@ -261,8 +263,10 @@ def test_the_fine_error_does_not_pull_at_the_coarse_network() -> None:
 # --- packed rendering ---
 
 
-def in_ball(positions: Tensor) -> Tensor:
-    return positions.norm(dim=1) < 1.2
+def ball_grid(radius: float) -> OccupancyGrid:
+    """Cells whose center lies in a ball around the origin."""
+    centers = np.stack(np.meshgrid(*[np.arange(-1.75, 2, 0.5)] * 3, indexing="ij"))
+    return OccupancyGrid.from_hull(Hull(np.full(3, -2.0), 0.5, np.linalg.norm(centers, axis=0) < radius)).double()
 
 
 def mask_density(field: nn.Module, occupied: Callable[[Tensor], Tensor]) -> None:
@@ -280,10 +284,10 @@ def mask_density(field: nn.Module, occupied: Callable[[Tensor], Tensor]) -> None
 @pytest.mark.parametrize("activation", ["relu", "softplus"])
 def test_culled_rendering_equals_dense_rendering_of_zeros(training: bool, activation: Any) -> None:
     settings: dict[str, Any] = {"density_activation": activation, "density_noise": 0.5, "background_color": "random"}
-    packed, dense = (tiny_model(**settings).train(training) for _ in range(2))
-    packed.occupied = in_ball
+    grid = ball_grid(1.2)
+    packed, dense = (tiny_model(grid=cells, **settings).train(training) for cells in (grid, None))
     for field in (dense.coarse, dense.fine):
-        mask_density(field, in_ball)
+        mask_density(field, grid.contains)
     batch = {"image": pixels()}
     losses, outputs = [], []
     for model in (packed, dense):
@@ -299,25 +303,23 @@ def test_culled_rendering_equals_dense_rendering_of_zeros(training: bool, activa
 
 
 def test_no_network_is_asked_in_empty_space(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = tiny_model().eval()
-    everywhere = recorded(model.fine, monkeypatch)
-    rendered(model)
-    model.occupied = in_ball
+    everywhere = recorded((dense := tiny_model().eval()).fine, monkeypatch)
+    rendered(dense)
+    model = tiny_model(grid=ball_grid(1.2)).eval()
     asked = recorded(model.coarse, monkeypatch)
     rendered(model)
-    positions, _, ray, _ = asked[0]
+    positions, _, ray_indices, _ = asked[0]
     assert 0 < len(positions) < RAYS * 6
-    assert bool(in_ball(positions).all())
+    assert bool(ball_grid(1.2).contains(positions).all())
     rays = tiny_rays(RAYS)
-    offset = positions - rays.origins[ray]
-    cosine = (offset * rays.directions[ray]).sum(1) / offset.norm(dim=1)
+    offset = positions - rays.origins[ray_indices]
+    cosine = (offset * rays.directions[ray_indices]).sum(1) / offset.norm(dim=1)
     torch.testing.assert_close(cosine, torch.ones_like(cosine))  # each point with its own ray
     assert len(everywhere[0][0]) == RAYS * 11
 
 
 def test_where_nothing_is_occupied_the_background_stays_and_nothing_is_learnt() -> None:
-    model = tiny_model().train()
-    model.occupied = lambda positions: torch.zeros(len(positions), dtype=torch.bool)
+    model = tiny_model(grid=ball_grid(0)).train()
     outputs = rendered(model)
     assert bool((outputs["rgb_fine"] == 1).all())
     model.loss(outputs, {"image": pixels()})[0].sum().backward()

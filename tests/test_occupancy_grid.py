@@ -20,7 +20,7 @@ def cells(seed: int = 0, share: float = 0.3) -> np.ndarray:
 
 def grid_of(shown: np.ndarray) -> OccupancyGrid:
     middle = np.array(shown.shape) * SIDE / 2
-    return OccupancyGrid.of(Hull(-middle, SIDE, shown)).double()
+    return OccupancyGrid.from_hull(Hull(-middle, SIDE, shown)).double()
 
 
 def cell_of(positions: Tensor, shown: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_no_part_of_a_ray_in_a_cell_is_left_out() -> None:
     """All cells occupied: as many samples as steps fit between the box's faces."""
     rays, step = tiny_rays(100), 0.01
     grid = grid_of(np.ones((7, 5, 6), dtype=bool))
-    grid.occupied.copy_(grid.possible)
+    grid.occupied.copy_(grid.static_mask)
     samples = grid.march(rays, step, None)
     inverse = 1 / rays.directions
     half = torch.tensor([7, 5, 6]) * SIDE / 2
@@ -114,18 +114,18 @@ def test_cells_without_density_go_their_neighbours_stay_and_none_outside_the_hul
     samples = grid.march(tiny_rays(500), 0.1, None)
     middle = torch.tensor([[0.0, 0.0, 0.1]], dtype=torch.float64)
     number = grid.locate(middle)
-    grid.remember(samples, torch.where(samples.cell_indices == number, 5.0, 0.5).double())
-    none = torch.zeros_like(grid.possible)
-    grid.judge(1.0, none)
-    place = np.unravel_index(int(number), grid.possible.shape)
-    expected = torch.zeros_like(grid.possible)
+    grid.update_max_density(samples, torch.where(samples.cell_indices == number, 5.0, 0.5).double())
+    none = torch.zeros_like(grid.static_mask)
+    grid.prune(1.0, none)
+    place = np.unravel_index(int(number), grid.static_mask.shape)
+    expected = torch.zeros_like(grid.static_mask)
     expected[tuple(slice(at - 1, at + 2) for at in place)] = True
-    assert torch.equal(grid.occupied, expected & grid.possible)
-    assert not bool(grid.largest.any())  # the next judgement is of what is seen from now on
+    assert torch.equal(grid.occupied, expected & grid.static_mask)
+    assert not bool(grid.max_density.any())  # the next judgement is of what is seen from now on
 
     again = none.clone()
     again[2, 1, 1] = again[0, 0, 0] = True
-    grid.judge(1.0, again)
+    grid.prune(1.0, again)
     assert torch.nonzero(grid.occupied).tolist() == [[2, 1, 1]]  # not the rim's
 
 
@@ -134,46 +134,47 @@ def test_the_largest_density_of_a_cell_counts() -> None:
     samples = grid.march(tiny_rays(300), 0.05, None)
     density = torch.from_numpy(np.random.default_rng(0).random(len(samples.t)))
     for part in (density, density / 2):
-        grid.remember(samples, part)
-    expected = np.zeros(grid.possible.numel())
+        grid.update_max_density(samples, part)
+    expected = np.zeros(grid.static_mask.numel())
     np.maximum.at(expected, samples.cell_indices.numpy(), density.numpy())
-    np.testing.assert_array_equal(grid.largest.reshape(-1).numpy(), expected)
+    np.testing.assert_array_equal(grid.max_density.reshape(-1).numpy(), expected)
 
 
 def test_a_split_moves_nothing() -> None:
     shown, points = cells(), torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (5000, 3)))
-    grid, whole = OccupancyGrid.of(Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown), 2).double(), grid_of(shown)
+    hull = Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown)
+    grid, whole = OccupancyGrid.from_hull(hull, 2).double(), grid_of(shown)
     for done in (1, 2):
-        grid.split()
+        grid.subdivide()
         assert torch.equal(grid.contains(points), whole.contains(points))
-        sides = (float(grid.first_side), float(grid.side), float(grid.finest_side))
+        sides = (float(grid.initial_cell_size), float(grid.cell_size), float(grid.finest_cell_size))
         assert sides == (SIDE, SIDE / 2**done, SIDE / 4)
-        torch.testing.assert_close(grid.middle, whole.middle)
-        assert float(grid.reach) == float(whole.reach)
-        assert torch.equal(grid.possible_after(0), whole.possible)
-    first, splits = OccupancyGrid.at_first(grid.state_dict())
-    assert splits == 2
-    assert not first.is_the_same_as(whole.float())  # may be split, that one not
-    assert first.is_the_same_as(OccupancyGrid.of(Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown), 2))
+        torch.testing.assert_close(grid.center, whole.center)
+        assert float(grid.half_extent) == float(whole.half_extent)
+        assert torch.equal(grid.static_mask_at(0), whole.static_mask)
+    loaded = OccupancyGrid.from_state(grid.float().state_dict())
+    assert loaded.state_dict().keys() == grid.state_dict().keys()
+    assert all(torch.equal(value, grid.state_dict()[key]) for key, value in loaded.state_dict().items())
+    assert not loaded.is_of_the_same_scene(whole.float())  # may be subdivided, that one not
+    assert loaded.is_of_the_same_scene(OccupancyGrid.from_hull(hull, 2))
 
 
 def test_doubled_cells_have_whatever_the_hull_has_and_split_are_the_hull() -> None:
     shown, points = cells(), torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (5000, 3)))
     hull = Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown)
-    grid, whole = OccupancyGrid.of(hull, 2, 2).double(), grid_of(shown)
+    grid, whole = OccupancyGrid.from_hull(hull, 2, 2).double(), grid_of(shown)
     inside = whole.contains(points)
-    assert float(grid.side) == 4 * SIDE
+    assert float(grid.cell_size) == 4 * SIDE
     cell = grid.locate(points)
     assert torch.equal(grid.contains(points), torch.isin(cell, cell[inside]))
-    rim = torch.ones_like(grid.possible)
+    rim = torch.ones_like(grid.static_mask)
     rim[1:-1, 1:-1, 1:-1] = False
-    assert not bool((grid.possible & rim).any())
+    assert not bool((grid.static_mask & rim).any())
     for _ in range(2):
-        grid.split()
+        grid.subdivide()
     assert torch.equal(grid.contains(points), inside)
-    first, splits = OccupancyGrid.at_first(grid.state_dict())
-    assert splits == 2
-    assert first.is_the_same_as(OccupancyGrid.of(hull, 2, 2))
-    assert not first.is_the_same_as(OccupancyGrid.of(hull, 2, 1))
-    told = (first.corner, float(first.side), first.hull, 2)
-    assert not first.is_the_same_as(OccupancyGrid(*told, coarser=1))  # of a hull in cells twice as large
+    first = OccupancyGrid.from_hull(hull, 2, 2)
+    assert first.is_of_the_same_scene(OccupancyGrid.from_state(grid.float().state_dict()))
+    assert not first.is_of_the_same_scene(OccupancyGrid.from_hull(hull, 2, 1))
+    larger = (first.aabb_min, float(first.cell_size), first.hull, 2)
+    assert not first.is_of_the_same_scene(OccupancyGrid(*larger, coarsening=1))  # of a hull in cells twice as large

@@ -51,34 +51,34 @@ def test_the_largest_image_decides() -> None:
 
 
 def test_the_papers_size_is_the_papers() -> None:
-    plan = resolve_config(config_with("pipeline.model.size", "paper"), of_size(8, 8))
-    model = plan.pipeline.model
+    resolved = resolve_config(config_with("pipeline.model.size", "paper"), of_size(8, 8))
+    model = resolved.pipeline.model
     assert isinstance(model, NeRFModelConfig)
     assert (model.depth, model.width) == (8, 256)
     assert (model.position_frequencies, model.direction_frequencies) == (10, 4)
     assert (model.num_coarse_samples, model.num_importance_samples) == (64, 128)
-    assert (plan.max_num_iterations, plan.optimizer.lr) == (200_000, 5e-4)
-    assert plan.pipeline.datamanager.train_num_rays_per_batch == 1024
+    assert (resolved.max_num_iterations, resolved.optimizer.lr) == (200_000, 5e-4)
+    assert resolved.pipeline.datamanager.train_num_rays_per_batch == 1024
 
 
 @pytest.mark.parametrize("size", ["auto", "paper", "small", "tiny"])
 def test_nothing_is_left_open(size: Any) -> None:
-    plan = resolve_config(config_with("pipeline.model.size", size), of_size(8, 8))
+    resolved = resolve_config(config_with("pipeline.model.size", size), of_size(8, 8))
 
     def left_open(config: Any) -> list[str]:
         fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
         nested = [name for value in fields.values() if dataclasses.is_dataclass(value) for name in left_open(value)]
         return nested + [name for name, value in fields.items() if value is None or value == "auto"]
 
-    assert left_open(plan) == [
+    assert left_open(resolved) == [
         "device_type",
         "data",
         "num_views",
         "views",
         "max_seconds",
-    ]  # the machine's, and None has a meaning
+    ]
     assert (
-        resolve_config(plan, of_size(800, 800)) == plan
+        resolve_config(resolved, of_size(800, 800)) == resolved
     )  # planning what is planned changes nothing, whatever the data
 
 
@@ -123,8 +123,8 @@ def test_the_experiment_is_named_after_the_data(tmp_path: Path) -> None:
 
 def test_a_preview_is_due_ten_times() -> None:
     for iterations, every in ((2000, 200), (25, 2), (9, 1), (1, 1)):
-        plan = resolve_config(config_with("max-num-iterations", iterations), of_size(8, 8))
-        assert plan.steps_per_eval_image == every
+        resolved = resolve_config(config_with("max-num-iterations", iterations), of_size(8, 8))
+        assert resolved.steps_per_eval_image == every
 
 
 REFUSED = [

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import cells, judged, tiny_rays
+from tiny import cells, occupied_after, tiny_rays
 from torch import Tensor
 
-from edge_se_sampler.errors import InputError
 from edge_se_sampler.models import lean
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import MIN_OPTICAL_DEPTH, UPDATE_INTERVAL, LeanModel
@@ -23,19 +22,23 @@ SIDE = 0.3
 EARLY = UPDATE_INTERVAL // 2
 
 
-def open_model(splits: int = 1, **changes: Any) -> LeanModel:
+def open_model(max_level: int = 1, **changes: Any) -> LeanModel:
     """In a cube of which nothing is known."""
     config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), **changes)
-    model = LeanModel(config, np.random.default_rng(0))
-    model.settle(OccupancyGrid.of(Hull(np.full(3, -1.2), SIDE, np.ones((8, 8, 8), dtype=bool)), splits))
-    return model.double().train()
+    grid = OccupancyGrid.from_hull(Hull(np.full(3, -1.2), SIDE, np.ones((8, 8, 8), dtype=bool)), max_level)
+    return LeanModel(config, np.random.default_rng(0), grid).double().train()
+
+
+def levels(model: LeanModel) -> tuple[int, int]:
+    """How often the cells have been subdivided, and how often they may be."""
+    return int(model.grid.level), int(model.grid.max_level)
 
 
 def seen(model: LeanModel, density: float) -> Tensor:
     """A cell in the middle in which training has seen a density, and none elsewhere: its place, (3,)."""
-    where = torch.tensor(cells(model).possible.shape) // 2
-    cells(model).largest.zero_()
-    cells(model).largest[tuple(where)] = density
+    where = torch.tensor(cells(model).static_mask.shape) // 2
+    cells(model).max_density.zero_()
+    cells(model).max_density[tuple(where)] = density
     return where
 
 
@@ -44,15 +47,15 @@ def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_other
     with torch.no_grad():
         model.features.table.normal_(generator=torch.Generator().manual_seed(0))  # pyright: ignore
     where = seen(model, 100.0)
-    cells(model).occupied.copy_(cells(model).possible)
+    cells(model).occupied.copy_(cells(model).static_mask)
     before = {key: value.clone() for key, value in model.eval()(tiny_rays(RAYS)).items()}
-    judged(model.train(), 2 * EARLY)
-    assert cells(model).splits.tolist() == [1, 0]
-    owned = torch.zeros_like(cells(model).possible)
+    occupied_after(model.train(), 2 * EARLY)
+    assert levels(model) == (1, 1)
+    owned = torch.zeros_like(cells(model).static_mask)
     owned[tuple(slice(2 * int(at) - 2, 2 * int(at) + 4) for at in where)] = True
-    assert torch.equal(model.features.owned, owned)  # pyright: ignore
+    assert torch.equal(cells(model).refined, owned)  # pyright: ignore
     assert bool(cells(model).occupied[owned].all())
-    cells(model).occupied.copy_(cells(model).possible)
+    cells(model).occupied.copy_(cells(model).static_mask)
     model.config = replace(model.config, step_size_voxels=1.0)  # as long a step as before
     for key, value in model.eval()(tiny_rays(RAYS)).items():
         torch.testing.assert_close(value, before[key], rtol=0, atol=1e-9)
@@ -61,17 +64,17 @@ def test_cells_are_split_where_something_was_found_and_nothing_is_rendered_other
 def test_split_cells_are_none_but_the_hulls() -> None:
     shown = torch.rand((8, 8, 8), generator=torch.Generator().manual_seed(0)) < 0.5
     shown[3:5, 3:5, 3:5] = True
-    model = LeanModel(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), np.random.default_rng(0))
-    model.settle(OccupancyGrid.of(Hull(np.full(3, -1.2), SIDE, shown.numpy()), 1, 1))
-    assert bool(cells(model).possible[2:4, 2:4, 2:4].all())  # of two cells each, and a rim
+    grid = OccupancyGrid.from_hull(Hull(np.full(3, -1.2), SIDE, shown.numpy()), 1, 1)
+    model = LeanModel(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), np.random.default_rng(0), grid)
+    assert bool(cells(model).static_mask[2:4, 2:4, 2:4].all())  # of two cells each, and a rim
     seen(model, 100.0)
-    judged(model, 2 * EARLY)
-    expected = torch.zeros_like(cells(model).possible)
+    occupied_after(model, 2 * EARLY)
+    expected = torch.zeros_like(cells(model).static_mask)
     expected[2:-2, 2:-2, 2:-2] = shown
-    assert torch.equal(cells(model).possible, expected)
+    assert torch.equal(cells(model).static_mask, expected)
     assert bool(cells(model).occupied.any())
     assert not bool((cells(model).occupied & ~expected).any())
-    owned = model.features.owned  # pyright: ignore
+    owned = cells(model).refined  # pyright: ignore
     assert bool(owned.any())
     assert not bool((owned & ~expected).any())
 
@@ -81,8 +84,8 @@ def test_cells_stay_large(reason: str) -> None:
     model = open_model(0 if reason == "no splits left" else 1)
     seen(model, 0.9 * MIN_OPTICAL_DEPTH / SIDE if reason == "nothing is solid" else 100.0)
     before = int(cells(model).occupied.sum())
-    assert judged(model, 3 * EARLY + 1 if reason == "not the time" else 2 * EARLY) == before
-    assert cells(model).splits[0] == 0
+    assert occupied_after(model, 3 * EARLY + 1 if reason == "not the time" else 2 * EARLY) == before
+    assert levels(model)[0] == 0
 
 
 @pytest.mark.parametrize("room", [6**3, 6**3 - 1])
@@ -91,43 +94,42 @@ def test_cells_are_split_again_once_they_are_few_enough(room: int, monkeypatch: 
     model = open_model(2)
     for step in (2, 3):
         seen(model, 100.0)
-        judged(model, step * EARLY)
-    assert cells(model).splits.tolist() == ([2, 0] if room == 6**3 else [1, 1])
+        occupied_after(model, step * EARLY)
+    assert levels(model) == ((2, 2) if room == 6**3 else (1, 2))
 
 
 def test_what_was_left_out_by_mistake_is_tried_again_found_and_split() -> None:
     model = open_model()
     assert model.features is not None
     seen(model, 100.0)
-    judged(model, 2 * EARLY)
-    owned, elsewhere = model.features.owned.clone(), (3, 3, 3)
+    occupied_after(model, 2 * EARLY)
+    owned, elsewhere = cells(model).refined.clone(), (3, 3, 3)
     assert not bool(owned[elsewhere])
     tried = torch.zeros_like(owned)
     for again in range(3, 200):
-        judged(model, again * UPDATE_INTERVAL)
+        occupied_after(model, again * UPDATE_INTERVAL)
         tried |= cells(model).occupied
-    assert bool(tried[cells(model).possible].float().mean() > 0.8)
-    cells(model).largest[elsewhere] = 100.0
-    judged(model, 200 * UPDATE_INTERVAL)
+    assert bool(tried[cells(model).static_mask].float().mean() > 0.8)
+    cells(model).max_density[elsewhere] = 100.0
+    occupied_after(model, 200 * UPDATE_INTERVAL)
     assert bool(cells(model).occupied[elsewhere])
-    assert bool(model.features.owned[elsewhere])
-    assert torch.equal(model.features.owned & owned, owned)
+    assert bool(cells(model).refined[elsewhere])
+    assert torch.equal(cells(model).refined & owned, owned)
 
 
-def test_a_state_with_split_cells_is_taken_up_with_and_without_the_scene() -> None:
+def test_a_state_with_subdivided_cells_is_loaded() -> None:
     model = open_model(2)
     for step in (2, 3):
         seen(model, 100.0)
-        judged(model, step * EARLY)
-    assert cells(model).splits.tolist() == [2, 0]
+        occupied_after(model, step * EARLY)
+    assert levels(model) == (2, 2)
     assert model.features is not None
     with torch.no_grad():
         model.features.table.normal_(generator=torch.Generator().manual_seed(0))
     rays = tiny_rays(RAYS)
-    unsettled = LeanModel(model.config, np.random.default_rng(5)).double()
-    for other in (open_model(2), unsettled):
-        other.load_state_dict(model.state_dict())
-        assert torch.equal(other.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
-        assert torch.equal(cells(other).occupied, cells(model).occupied)
-    with pytest.raises(InputError, match="cells are not the checkpoint's"):
-        open_model(1).load_state_dict(model.state_dict())
+    other = LeanModel(model.config, np.random.default_rng(5), OccupancyGrid.from_state(cells(model).state_dict()))
+    other.double().load_state_dict(model.state_dict())
+    assert torch.equal(other.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
+    assert torch.equal(other.grid.occupied, model.grid.occupied)
+    assert other.grid.is_of_the_same_scene(open_model(2).grid)
+    assert not other.grid.is_of_the_same_scene(open_model(1).grid)

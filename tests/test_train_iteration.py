@@ -111,7 +111,7 @@ def test_the_learning_rate_decays_to_its_final_fraction() -> None:
 
 def test_groups_of_weights_have_their_own_learning_rates() -> None:
     network, features = torch.nn.Parameter(torch.ones(3)), torch.nn.Parameter(torch.ones(2))
-    optimizer = create_adam([([network], 1.0), ([features], 6.0)], OptimizerConfig(lr=0.01))
+    optimizer = create_adam([([network], 1.0), ([features], 6.0)], 0.01, OptimizerConfig())
     assert [group["lr"] for group in optimizer.param_groups] == [0.01, pytest.approx(0.06)]
 
 
@@ -160,7 +160,7 @@ def test_a_fused_step_where_torch_has_one(supported: bool, monkeypatch: pytest.M
 
     monkeypatch.setattr(torch.optim, "Adam", old)
     weight = torch.nn.Parameter(torch.ones(3))
-    optimizer = create_adam([([weight], 1.0)], OptimizerConfig(lr=1e-3, eps=1e-9, fused=True))
+    optimizer = create_adam([([weight], 1.0)], 1e-3, OptimizerConfig(eps=1e-9, fused=True))
     assert bool(optimizer.defaults["fused"]) == supported
     assert optimizer.defaults["eps"] == 1e-9
-    assert not create_adam([([weight], 1.0)], OptimizerConfig(lr=1e-3)).defaults["fused"]
+    assert not create_adam([([weight], 1.0)], 1e-3, OptimizerConfig()).defaults["fused"]

@@ -1,4 +1,4 @@
-"""A tiny NeRF, a model's cells, rays through its sampled shell, views of random pixels, and a tiny training's flags."""
+"""A tiny NeRF, a model's grid, rays through its sampled shell, views of random pixels, and a tiny training's flags."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ def tiny_config(**changes: Any) -> NeRFModelConfig:
     return replace(small, **changes)
 
 
-def tiny_model(seed: int = 0, **changes: Any) -> NeRFModel:
-    """It, in float64."""
-    return NeRFModel(tiny_config(**changes), np.random.default_rng(seed)).double()
+def tiny_model(seed: int = 0, grid: OccupancyGrid | None = None, **changes: Any) -> NeRFModel:
+    """A NeRF of that config, in float64."""
+    return NeRFModel(tiny_config(**changes), np.random.default_rng(seed), grid).double()
 
 
 def cells(model: RayModel) -> OccupancyGrid:
-    """Where a settled model is asked."""
+    """The grid of a model that has one."""
     assert model.grid is not None
     return model.grid
 
 
-def judged(model: RayModel, step: int) -> int:
-    """How many cells are occupied when a step has begun."""
+def occupied_after(model: RayModel, step: int) -> int:
+    """How many cells are occupied once a step has begun, which may prune and subdivide them."""
     model.begin_step(step, step + 1)
     return int(cells(model).occupied.sum())
 

@@ -9,7 +9,8 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
+from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.models.config import INFINITY, LeanModelConfig, ModelConfig, NeRFModelConfig, SizePreset
 from edge_se_sampler.protocol import InstantiateConfig
 
 
@@ -43,6 +44,16 @@ class OptimizerConfig:
     """Adam's epsilon."""
     fused: bool = False
     """Take the step in one pass over the weights: faster, and rounded a little differently."""
+
+    def check(self) -> None:
+        """Refuse values without meaning.
+
+        Raises:
+            InputError: one is out of its range.
+        """
+        check_value("optimizer.lr", self.lr, self.lr is None or 0 < self.lr < INFINITY, "above 0")
+        check_value("optimizer.final-fraction", self.final_fraction, 0 < self.final_fraction <= 1, "in (0, 1]")
+        check_value("optimizer.eps", self.eps, 0 <= self.eps < INFINITY, "at least 0")
 
 
 @dataclass(frozen=True)
@@ -78,6 +89,67 @@ class TrainerConfig(InstantiateConfig):
     machine: MachineConfig = field(default_factory=MachineConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+
+    @property
+    def preset(self) -> SizePreset:
+        """The numbers of the model's size, which is not auto, with those set here in their place: none is left open."""
+        rays = self.pipeline.datamanager.train_num_rays_per_batch
+        given = {"learning_rate": self.optimizer.lr, "rays": rays, "iterations": self.max_num_iterations}
+        return self.pipeline.model.preset.overridden_by(given)
+
+    @property
+    def preview_interval(self) -> int:
+        """Steps between previews: as given, or a tenth of the iterations."""
+        given = self.steps_per_eval_image
+        return max(1, self.preset.iterations // 10) if given is None else given
+
+    def check(self) -> None:
+        """Refuse values without meaning, in a config whose size is decided.
+
+        Raises:
+            InputError: one is out of its range, or has no effect with the others.
+        """
+        at_least_one = {
+            "max-num-iterations": self.max_num_iterations,
+            "steps-per-save": self.steps_per_save,
+            "steps-per-eval-image": self.steps_per_eval_image,
+            "steps-per-log": self.steps_per_log,
+            "pipeline.datamanager.train-num-rays-per-batch": self.pipeline.datamanager.train_num_rays_per_batch,
+        }
+        for flag, value in at_least_one.items():
+            check_value(flag, value, value is None or value >= 1, "at least 1")
+        check_seconds(self.max_seconds)
+        for name in (self.method_name, self.experiment_name):
+            if name in ("", ".", "..") or "/" in str(name) or "\0" in str(name):
+                raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
+        self.optimizer.check()
+        self.pipeline.model.check("pipeline.model.")
+        self._check_combinations()
+
+    def _check_combinations(self) -> None:
+        manager, model = self.pipeline.datamanager, self.pipeline.model
+        if manager.skip_empty_rays and not model.needs_grid:
+            raise InputError(
+                "--pipeline.datamanager.skip-empty-rays has no effect here; add "
+                "--pipeline.model.empty-space-skipping True"
+            )
+        if not isinstance(model, LeanModelConfig):
+            return
+        if self.reinit_dead:
+            raise InputError("--reinit-dead: this model's density is never 0, it cannot die; leave the flag out")
+        if getattr(manager.pixel_sampler, "error_source", "fine") == "coarse":
+            raise InputError(
+                "--pipeline.datamanager.pixel-sampler.error-source is coarse: this model has no coarse network"
+            )
+
+
+def check_seconds(seconds: float | None, flag: str = "max-seconds") -> None:
+    """Refuse a time limit that is none; None: no limit.
+
+    Raises:
+        InputError: it is not above 0 and finite.
+    """
+    check_value(flag, seconds, seconds is None or 0 < seconds < INFINITY, "above 0, and finite")
 
 
 @dataclass(frozen=True)

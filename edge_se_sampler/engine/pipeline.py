@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
+
+from torch import Tensor
 
 from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.occupancy.scene_analysis import analyze_scene, live_pixels
+from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene, live_pixels
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
+
+OTHER_WEIGHTS = "the checkpoint's weights are not this model's: another version wrote them"
 
 
 @dataclass(frozen=True)
@@ -23,23 +31,78 @@ class Pipeline:
     """A RayModel."""
 
     @classmethod
-    def build(cls, config: TrainerConfig, views: Views, device: str) -> Pipeline:
-        """Set up both for a planned config."""
-        model_config = config.pipeline.model
-        manager_config, has_masks = config.pipeline.datamanager, False
-        model = build_model(config, device)
-        if model.needs_cells:
-            told = analyze_scene(views, model_config)
-            model.settle(told.grid())
-            has_masks = told.silhouettes > 0
+    def build(
+        cls, config: TrainerConfig, views: Views, device: str, saved_grid: OccupancyGrid | None = None
+    ) -> Pipeline:
+        """Set up both for a resolved config.
+
+        Args:
+            saved_grid: the occupancy grid of the checkpoint that is resumed; None: the scene's own.
+
+        Raises:
+            InputError: the scene is not the saved grid's.
+        """
+        model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
+        grid, has_masks = saved_grid, False
+        if model_config.needs_grid:
+            analysis = analyze_views(views, model_config)
+            grid, has_masks = analysis.grid(), analysis.silhouettes > 0
+            if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
+                raise InputError(
+                    "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
+                    "this machine rounds otherwise; resume with what it began with, or train anew"
+                )
             if manager_config.skip_empty_rays and has_masks:
-                views = views.with_masks(live_pixels(views, told.hull))
+                views = views.with_masks(live_pixels(views, analysis.hull))
         if isinstance(manager_config.pixel_sampler, SamplingSettings):
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
-        return cls(manager_config.setup(views=views, device=device, background_color=background), model)
+        datamanager = manager_config.setup(views=views, device=device, background_color=background)
+        return cls(datamanager, build_model(config, device, saved_grid or grid))
 
 
-def build_model(config: TrainerConfig, device: str) -> RayModel:
-    """The model with its initial weights: a function of the seed and the size alone, whatever the method."""
-    return config.pipeline.model.setup(rng=stream(config.machine.seed, 0, Stream.WEIGHTS)).to(device)
+def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
+    """`analyze_scene` with a model's settings."""
+    return analyze_scene(
+        views,
+        near=config.near,
+        far=config.far,
+        voxel_size_px=config.voxel_size_px,
+        by_alpha=config.culls_by_alpha,
+        prunable=config.prunes_cells,
+    )
+
+
+def build_model(config: TrainerConfig, device: str, grid: OccupancyGrid | None = None) -> RayModel:
+    """The model with its initial weights: a function of the seed and the size alone, whatever the method.
+
+    Args:
+        grid: of a model that needs one.
+    """
+    rng = stream(config.machine.seed, 0, Stream.WEIGHTS)
+    return config.pipeline.model.setup(rng=rng, grid=grid).to(device)
+
+
+def saved_grid(weights: Mapping[str, Tensor]) -> OccupancyGrid | None:
+    """The occupancy grid in a checkpoint's weights, None if it has none.
+
+    Raises:
+        InputError: another version wrote it.
+    """
+    state = {key.removeprefix("grid."): value for key, value in weights.items() if key.startswith("grid.")}
+    try:
+        return OccupancyGrid.from_state(state) if state else None
+    except KeyError as problem:
+        raise InputError(OTHER_WEIGHTS) from problem
+
+
+def load_weights(model: RayModel, weights: Mapping[str, Tensor]) -> None:
+    """Give a model a checkpoint's weights; its grid is the checkpoint's, see `saved_grid`.
+
+    Raises:
+        InputError: they are another model's.
+    """
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as problem:
+        raise InputError(OTHER_WEIGHTS) from problem

@@ -15,10 +15,10 @@ import torch
 from edge_se_sampler.data.blender import Split, has_split, read_blender
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
-from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline, build_model
+from edge_se_sampler.engine.config import TrainerConfig, check_seconds
+from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import Picture, to_pictures
-from edge_se_sampler.engine.resolve import check_seconds, resolve_config
+from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
@@ -45,7 +45,7 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     """Continue an interrupted run under its own settings (`run.config`); max_seconds holds for this session.
 
     Raises:
-        InputError: no such run, no or bad checkpoint, or its data is gone.
+        InputError: no such run, no or bad checkpoint, or its data is gone or has changed.
     """
     check_seconds(max_seconds)
     config = dataclasses.replace(config, max_seconds=max_seconds)
@@ -53,7 +53,8 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
     disable_malloc_trimming()
-    trainer = config.setup(run=run, pipeline=Pipeline.build(config, views, device), preview=preview)
+    pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
+    trainer = config.setup(run=run, pipeline=pipeline, preview=preview)
     trainer.resume(state)
     return trainer
 
@@ -69,8 +70,8 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     """
     checkpoint = latest_checkpoint(run.checkpoints)
     state = load_checkpoint(checkpoint, config_digest(config))
-    model = build_model(config, choose_device(config.machine.device_type))
-    model.load_state_dict(state["model"])
+    model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
+    load_weights(model, state["model"])
     return model, checkpoint
 
 
@@ -146,7 +147,7 @@ def describe_run(trainer: Trainer) -> str:
     if isinstance(sampler, SamplingSettings):
         until = "until the object is learned"
         if sampler.schedule != "adaptive":
-            until = f"for {math.ceil(sampler.early_length(config.max_num_iterations or 0))} iterations"
+            until = f"for {math.ceil(sampler.early_length(config.preset.iterations))} iterations"
         early = "" if sampler.early == sampler.late else f"{sampler.early} {until}, then "
         lines.append(f"pixels   {early}{sampler.late}")
     return "\n".join(lines)

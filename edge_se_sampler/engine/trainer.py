@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.pipeline import Pipeline, load_weights
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
@@ -38,8 +38,8 @@ class Trainer:
 
     def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
-        self.planned_steps = config.max_num_iterations or 0
-        self.optimizer = create_adam(pipeline.model.parameter_groups(), config.optimizer)
+        self.planned_steps = config.preset.iterations
+        self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset.learning_rate, config.optimizer)
         decay = config.optimizer.final_fraction
         self.scheduler = LambdaLR(self.optimizer, lambda step: decay ** (step / self.planned_steps))
         self.next_step = 0
@@ -60,9 +60,9 @@ class Trainer:
         """Take up the run at a checkpoint's state.
 
         Raises:
-            InputError: it is another model's, or of a scene that has changed since.
+            InputError: it is another model's.
         """
-        self.pipeline.model.load_state_dict(state["model"])
+        load_weights(self.pipeline.model, state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.scheduler.load_state_dict(state["scheduler"])
         if self.dead_network_reset is not None:
@@ -91,7 +91,7 @@ class Trainer:
                 stop = ended or self.stop_requested or time.monotonic() >= deadline
                 if ended or step % config.steps_per_log == 0:
                     self._log(step, loss, learning_rate)
-                if ended or self.next_step % (config.steps_per_eval_image or 1) == 0:
+                if ended or self.next_step % config.preview_interval == 0:
                     self._preview(step)
                     began = time.monotonic() - self.elapsed  # looking is not training
                 if stop or self.next_step % config.steps_per_save == 0:
@@ -191,7 +191,7 @@ class Trainer:
         self.run.preview(step, rendered)
 
     def _note(self, loss: float) -> str:
-        rate = self.next_step * (self.config.pipeline.datamanager.train_num_rays_per_batch or 0) / self.elapsed
+        rate = self.next_step * self.config.preset.rays / self.elapsed
         psnr = "" if self._preview_psnr is None else f", PSNR {self._preview_psnr:.2f}"
         return f"{rate:,.0f} rays/s, loss {loss:.5f}{psnr}"
 
@@ -214,9 +214,11 @@ class Trainer:
                 signal.signal(number, handler)
 
 
-def create_adam(groups: list[tuple[list[torch.nn.Parameter], float]], config: OptimizerConfig) -> torch.optim.Adam:
-    """Adam over groups of weights, each with its learning rate as a multiple of the config's (which is resolved)."""
-    parts = [{"params": weights, "lr": (config.lr or 0.0) * scale} for weights, scale in groups]
+def create_adam(
+    groups: list[tuple[list[torch.nn.Parameter], float]], learning_rate: float, config: OptimizerConfig
+) -> torch.optim.Adam:
+    """Adam over groups of weights, each with the scale of its learning rate."""
+    parts = [{"params": weights, "lr": learning_rate * scale} for weights, scale in groups]
     if config.fused:
         try:
             return torch.optim.Adam(parts, eps=config.eps, fused=True)

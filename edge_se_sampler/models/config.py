@@ -1,17 +1,57 @@
-"""What can be set of the NeRF model, and its three sizes. Torch-free."""
+"""What can be set of the models, and what the three sizes stand for. Torch-free."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.protocol import InstantiateConfig
+
+INFINITY = float("inf")
+
+
+@dataclass(frozen=True)
+class SizePreset:
+    """The numbers that a size stands for: networks, samples of a ray, and a training schedule that suits them."""
+
+    width: int
+    depth: int
+    position_frequencies: int
+    direction_frequencies: int
+    learning_rate: float
+    rays: int
+    """Of a training step."""
+    iterations: int
+    num_coarse_samples: int = 0
+    num_importance_samples: int = 0
+    num_unseen_rays: int = 0
+
+    def overridden_by(self, values: Mapping[str, Any]) -> SizePreset:
+        """The preset with its numbers replaced by the values of the same names; None replaces nothing."""
+        return replace(self, **{key: value for key, value in values.items() if key in vars(self) and value is not None})
+
+
+# A small network is wide rather than deep: a deep narrow one more often starts dead, at the same quality. Higher
+# learning rates than tiny's lose a network now and then.
+NERF_PRESETS = {
+    "paper": SizePreset(256, 8, 10, 4, 5e-4, 1024, 200_000, num_coarse_samples=64, num_importance_samples=128),
+    "small": SizePreset(128, 4, 8, 3, 2e-3, 512, 20_000, num_coarse_samples=48, num_importance_samples=48),
+    "tiny": SizePreset(96, 2, 6, 2, 3e-3, 512, 1_500, num_coarse_samples=32, num_importance_samples=32),
+}
+LEAN_PRESETS = {
+    "paper": SizePreset(64, 1, 6, 2, 6e-3, 512, 30_000),
+    "small": SizePreset(64, 1, 6, 2, 6e-3, 512, 20_000),
+    "tiny": SizePreset(64, 1, 6, 2, 6e-3, 256, 12_000),
+}
 
 
 @dataclass(frozen=True)
 class ModelConfig(InstantiateConfig):
-    """What every model has. What is left out (None) follows from the size."""
+    """What every model has. What is left out (None) follows from the size, see `apply_preset`."""
+
+    presets: ClassVar[Mapping[str, SizePreset]] = NERF_PRESETS
 
     size: Literal["auto", "paper", "small", "tiny"] = "auto"
     """Networks and samples: the paper's, or smaller ones for smaller images; auto decides by the images."""
@@ -30,12 +70,53 @@ class ModelConfig(InstantiateConfig):
     near: float = 2.0
     """Depth along the optical axis at which samples begin, world units."""
     far: float = 6.0
-    """Depth at which samples end."""
+    """Depth at which samples end, world units."""
     empty_space_skipping: bool = False
-    """Whether what the scene does not need is left out: auto derives it from cameras and alpha, see inspect."""
+    """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
     voxel_size_px: float = 1.0
-    """Side of a cell that is kept or left out, in pixels' footprints at the middle of the scene; larger where there
-    would be more cells than are worth their memory."""
+    """Size of such a cell, in footprints of a pixel at the center of the scene; larger where there would be more cells
+    than are worth their memory."""
+
+    @property
+    def preset(self) -> SizePreset:
+        """The numbers of its size, which is not auto, with those set here in their place: none is left open."""
+        return self.presets[self.size].overridden_by(vars(self))
+
+    @property
+    def needs_grid(self) -> bool:
+        """Whether the model is built on the scene's occupancy grid."""
+        return self.empty_space_skipping
+
+    @property
+    def culls_by_alpha(self) -> bool:
+        """Whether the grid is the visual hull of the alpha masks, where there are any."""
+        return self.empty_space_skipping
+
+    @property
+    def prunes_cells(self) -> bool:
+        """Whether training prunes the grid's cells."""
+        return False
+
+    def check(self, prefix: str = "") -> None:
+        """Refuse values without meaning, in a config whose size is decided.
+
+        Args:
+            prefix: of the flags' names in the message.
+
+        Raises:
+            InputError: one is out of its range.
+        """
+        if not 0 <= self.near < self.far < INFINITY:
+            raise InputError(f"--{prefix}near is {self.near}, --{prefix}far {self.far}: 0 <= near < far")
+        size_px, preset = self.voxel_size_px, self.preset
+        check_value(f"{prefix}voxel-size-px", size_px, 0 < size_px <= 1000, "above 0, at most 1000")
+        check_value(f"{prefix}depth", preset.depth, preset.depth >= 1, "at least 1")
+        check_value(
+            f"{prefix}width", preset.width, preset.width >= 2, "at least 2 (the layer of the direction has half of it)"
+        )
+        for name in ("position", "direction"):
+            frequencies = getattr(preset, f"{name}_frequencies")
+            check_value(f"{prefix}{name}-frequencies", frequencies, 0 <= frequencies <= 24, "between 0 and 24")
 
     @property
     def background_level(self) -> float:
@@ -45,43 +126,70 @@ class ModelConfig(InstantiateConfig):
 
 @dataclass(frozen=True)
 class NeRFModelConfig(ModelConfig):
-    """The original NeRF: two networks, coarse and fine. With it neither is asked outside of the hull."""
+    """The original NeRF: two networks, coarse and fine."""
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.nerf:NeRFModel"
 
     num_coarse_samples: int | None = None
     """Stratified samples along a ray."""
     num_importance_samples: int | None = None
-    """Further samples of the fine network, where the coarse one has seen something."""
+    """Further samples for the fine network, drawn by the coarse one's weights."""
     density_activation: Literal["relu", "softplus"] = "relu"
     """What makes the raw density non-negative; softplus (shifted by 1, the last interval finite) cannot die."""
     density_noise: float = 0.0
     """Standard deviation of noise added to the raw density in training."""
 
+    def check(self, prefix: str = "") -> None:
+        """As `ModelConfig`."""
+        super().check(prefix)
+        coarse, fine = self.preset.num_coarse_samples, self.preset.num_importance_samples
+        check_value(f"{prefix}num-coarse-samples", coarse, coarse >= 3, "at least 3")
+        check_value(f"{prefix}num-importance-samples", fine, fine >= 1, "at least 1")
+        check_value(f"{prefix}density-noise", self.density_noise, 0 <= self.density_noise < INFINITY, "at least 0")
+
 
 @dataclass(frozen=True)
 class LeanModelConfig(ModelConfig):
-    """One small network on features that are kept where the scene is, asked only there."""
+    """One small network on a grid of features, evaluated only where the scene is."""
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.lean:LeanModel"
+    presets: ClassVar[Mapping[str, SizePreset]] = LEAN_PRESETS
 
     empty_space_skipping: bool = True
-    """Whether the parts below are at work; off: samples along all of the box."""
+    """Whether cells are culled as the next two say; off: all of the box is sampled."""
     cull_by_alpha: bool = True
-    """Leave out what lies outside of the alpha masks' visual hull."""
+    """Leave out what lies outside the visual hull of the alpha masks."""
     cull_by_density: bool = True
-    """Leave out where training has seen no density; such cells are tried again now and then."""
+    """Leave out cells in which training has seen no density; some of them are reactivated now and then."""
     step_size_voxels: float = 1.0
-    """Distance between samples, in sides of a cell."""
+    """Distance between samples, as a multiple of a cell's size."""
     feature_dim: int = 8
-    """Numbers kept at each corner of a cell; 0: the network alone has to know the scene."""
+    """Features at each corner of a cell; 0: the network has the encoded position alone."""
     feature_lr_scale: float = 6.0
-    """Learning rate of the features, in the network's."""
+    """Learning rate of the features, as a multiple of the network's."""
 
     @property
-    def learns_cells(self) -> bool:
-        """Whether training tells which cells are empty."""
+    def needs_grid(self) -> bool:
+        """Always: the features lie at its corners."""
+        return True
+
+    @property
+    def culls_by_alpha(self) -> bool:
+        """As `ModelConfig`."""
+        return self.empty_space_skipping and self.cull_by_alpha
+
+    @property
+    def prunes_cells(self) -> bool:
+        """As `ModelConfig`."""
         return self.empty_space_skipping and self.cull_by_density
+
+    def check(self, prefix: str = "") -> None:
+        """As `ModelConfig`."""
+        super().check(prefix)
+        step, scale = self.step_size_voxels, self.feature_lr_scale
+        check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
+        check_value(f"{prefix}feature-dim", self.feature_dim, 0 <= self.feature_dim <= 64, "between 0 and 64")
+        check_value(f"{prefix}feature-lr-scale", scale, 0 < scale < INFINITY, "above 0")
 
 
 @dataclass(frozen=True)
@@ -91,96 +199,51 @@ class InfoNeRFModelConfig(NeRFModelConfig):
     _target: ClassVar[type | str] = "edge_se_sampler.models.infonerf:InfoNeRFModel"
 
     num_unseen_rays: int | None = None
-    """Unseen rays of a step; left out, as many as it trains on (its code: 1024 and 1024); at 0 there is no entropy."""
+    """Unseen rays of a step; left out, as many as are trained on (its code: 1024 and 1024); 0: none."""
     entropy_weight: float = 0.001
-    """Of the rays' entropy, in bits."""
+    """Weight of the unseen rays' entropy, in bits."""
     entropy_threshold: float = 0.1
-    """Accumulation above which a ray counts as one that hits."""
+    """Accumulation above which a ray counts as one that hits something."""
     gain_weight: float = 0.0
-    """Of the information gain, which renders every ray twice. Its code ships with 0 for Blender scenes and 2e-5 for
-    DTU; at 1 training does not converge."""
+    """Weight of the information gain, which renders every ray twice. InfoNeRF's code ships with 0 for Blender scenes
+    and 2e-5 for DTU; at 1 training does not converge."""
     gain_degrees: float = 5.0
-    """Rays are turned by up to this about each axis."""
+    """Largest angle about each axis by which rays are rotated for the information gain."""
     gain_rate: float = 0.5
-    """What the weight is multiplied with every gain_steps."""
+    """Factor by which gain_weight decays every gain_steps."""
     gain_steps: int = 5000
     """Iterations between two such decays."""
+
+    def check(self, prefix: str = "") -> None:
+        """As `ModelConfig`."""
+        super().check(prefix)
+        check_value(f"{prefix}num-unseen-rays", self.num_unseen_rays, self.preset.num_unseen_rays >= 0, "at least 0")
+        for name in ("entropy_weight", "gain_weight", "gain_degrees", "gain_rate"):
+            value = getattr(self, name)
+            check_value(prefix + name.replace("_", "-"), value, 0 <= value < INFINITY, "at least 0")
+        threshold = self.entropy_threshold
+        check_value(f"{prefix}entropy-threshold", threshold, 0 <= threshold < 1, "in [0, 1)")
+        check_value(f"{prefix}gain-steps", self.gain_steps, self.gain_steps >= 1, "at least 1")
 
 
 Model = TypeVar("Model", bound=ModelConfig)
 
 
-@dataclass(frozen=True)
-class SizePreset(Generic[Model]):
-    """One size: the model, and a plan of training that suits it."""
-
-    model: Model
-    learning_rate: float
-    rays: int
-    iterations: int
-
-
-def _nerf(size: Any, width: int, depth: int, position: int, direction: int, coarse: int, fine: int) -> NeRFModelConfig:
-    shape = NeRFModelConfig(size, width, depth, position, direction)
-    return replace(shape, num_coarse_samples=coarse, num_importance_samples=fine)
-
-
-# tiny is wide rather than deep: 0.4 % of 500 seeds begin with a dead network, where 4 x 64 has 3.7 % of 300, at the
-# same quality for the same steps. At a rate of 5e-3 one of 18 seeds lost a network early, at 2.5e-3 to 3e-3 none of 12.
-SIZES: dict[str, SizePreset[NeRFModelConfig]] = {
-    "paper": SizePreset(_nerf("paper", 256, 8, 10, 4, 64, 128), 5e-4, 1024, 200_000),
-    "small": SizePreset(_nerf("small", 128, 4, 8, 3, 48, 48), 2e-3, 512, 20_000),
-    "tiny": SizePreset(_nerf("tiny", 96, 2, 6, 2, 32, 32), 3e-3, 512, 1_500),
-}
-
-
-def _lean(size: Any, rays: int, iterations: int) -> SizePreset[LeanModelConfig]:
-    shape = LeanModelConfig(size, width=64, depth=1, position_frequencies=6, direction_frequencies=2)
-    return SizePreset(shape, 6e-3, rays, iterations)
-
-
-# Seed 100. 100 pixels a side, 2500 steps, rate 2e-3 and features ten times that against 6e-3 and six times: bricks
-# 32.23 and 32.61 dB, ficus 30.13 and 30.36, drums 29.28 and 29.71. Two layers and cells of 1.6 pixels against one and
-# of 1.0, 60 CPU seconds: bricks 33.76 and 35.08 dB, materials 33.54 and 33.78, mic 33.09 and 33.57. Two layers and 2e-3
-# against one and 6e-3: bricks at 200 pixels, 512 rays, 60 s, 33.80 and 34.86 dB; at 400 pixels, 1024 rays and 512,
-# 100 s, 33.35 and 34.41, drums 29.77 and 30.75. 4, 6, 7 frequencies: 200 pixels, 40 s, bricks 33.91, 34.12, 34.12,
-# drums 30.38, 30.42, 30.49; 4, 6, 8 at 400 pixels, 80 s, bricks 33.65, 33.88, 33.78; at 100 pixels see the chart
-LEAN = {"paper": _lean("paper", 512, 30_000), "small": _lean("small", 512, 20_000), "tiny": _lean("tiny", 256, 12_000)}
-
-
-def check_fineness(config: ModelConfig, prefix: str = "") -> None:
-    """Refuse depths, cells and steps that no scene can be divided by.
-
-    Args:
-        prefix: of the flags' names.
-
-    Raises:
-        InputError: one is out of its range.
-    """
-    if not 0 <= config.near < config.far < float("inf"):
-        raise InputError(f"--{prefix}near is {config.near}, --{prefix}far {config.far}: 0 <= near < far")
-    if not 0 < config.voxel_size_px <= 1000:
-        raise InputError(f"--{prefix}voxel-size-px is {config.voxel_size_px}: must be above 0, at most 1000")
-    if isinstance(config, LeanModelConfig) and not 0.05 <= config.step_size_voxels < float("inf"):
-        raise InputError(f"--{prefix}step-size-voxels is {config.step_size_voxels}: must be at least 0.05")
-
-
-def size_for(pixels_a_side: int) -> str:
+def size_for(pixels_a_side: int) -> Literal["paper", "small", "tiny"]:
     """The size that "auto" stands for: by the images' longer side."""
     if pixels_a_side <= 128:
         return "tiny"
     return "small" if pixels_a_side <= 256 else "paper"
 
 
-def preset_of(config: ModelConfig, size: str) -> SizePreset[Any]:
-    """What a size stands for, with this kind of model."""
-    return (LEAN if isinstance(config, LeanModelConfig) else SIZES)[size]
+def apply_preset(config: Model, rays: int) -> Model:
+    """A config whose size is decided, with every None replaced by the size's number.
 
-
-def apply_preset(config: Model, size: str, rays: int) -> Model:
-    """The config with every None replaced by the size's value, or by a step's number of rays."""
-    preset = preset_of(config, size).model
-    if isinstance(config, InfoNeRFModelConfig) and config.num_unseen_rays is None:
-        config = replace(config, num_unseen_rays=rays)
-    chosen = {key: getattr(preset, key) if value is None else value for key, value in vars(config).items()}
-    return replace(config, **chosen | {"size": size})
+    Args:
+        rays: of a training step; as many unseen ones, where the config leaves that open.
+    """
+    preset = config.presets[config.size].overridden_by({"num_unseen_rays": rays})
+    left_open = {
+        key: getattr(preset, key) for key, value in vars(config).items() if value is None and key in vars(preset)
+    }
+    return replace(config, **left_open)

@@ -1,7 +1,7 @@
 """The radiance field (NeRF, figure 7): position and direction -> density and colour.
 
-m   points that are evaluated, packed: point i lies on ray ray[i]
-n   rays; what depends on the direction alone is computed once a ray
+m   points that are evaluated, packed: point i lies on ray ray_indices[i]
+n   rays; what depends on the direction alone is computed once for each
 """
 
 from __future__ import annotations
@@ -14,26 +14,27 @@ from torch import Tensor, nn
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.encoding import encoded_size, positional_encoding
 
-SKIP_AFTER = 5
-"""The encoded position joins again after this layer, if there are more."""
+SKIP_LAYER = 5
+"""Number of the layer, from 0, that takes the encoded position again (a skip connection)."""
 
 
 class NeRFField(nn.Module):
     """The MLP: `depth` layers for the position, one more for the direction.
 
     Args:
-        config: resolved, without None.
+        config: resolved.
         rng: of the initial weights.
     """
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
         super().__init__()
-        self.position_frequencies = config.position_frequencies or 0
-        self.direction_frequencies = config.direction_frequencies or 0
+        preset = config.preset
+        self.position_frequencies = preset.position_frequencies
+        self.direction_frequencies = preset.direction_frequencies
         self.softplus = config.density_activation == "softplus"
-        width, depth = config.width or 0, config.depth or 0
+        width, depth = preset.width, preset.depth
         encoded = encoded_size(3, self.position_frequencies)
-        widths = [encoded] + [width + encoded if i == SKIP_AFTER else width for i in range(1, depth)]
+        widths = [encoded] + [width + encoded if i == SKIP_LAYER else width for i in range(1, depth)]
         self.layers = nn.ModuleList(linear(size, width) for size in widths)
         self.density = linear(width, 1)
         self.feature = linear(width, width)
@@ -41,17 +42,17 @@ class NeRFField(nn.Module):
         self.color = linear(width // 2, 3)
         self.initialize(config.initialization, rng)
 
-    def initialize(self, how: str, rng: np.random.Generator) -> None:
-        """Give every layer initial weights, see `initialize`."""
-        initialize_all(self, how, rng)
+    def initialize(self, scheme: str, rng: np.random.Generator) -> None:
+        """Give every layer new initial weights, see `initialize_linear`."""
+        initialize_all(self, scheme, rng)
 
-    def forward(self, positions: Tensor, directions: Tensor, ray: Tensor | None, noise: Tensor | None = None):
+    def forward(self, positions: Tensor, directions: Tensor, ray_indices: Tensor | None, noise: Tensor | None = None):
         """Evaluate points.
 
         Args:
             positions: (m, 3).
             directions: (n, 3) unit.
-            ray: (m,) int64; None: the points are all samples of ray 0, then all of ray 1, ...
+            ray_indices: (m,) int64; None: the points are all samples of ray 0, then all of ray 1, ...
             noise: (m,) added to the raw density, or None.
 
         Returns:
@@ -60,51 +61,51 @@ class NeRFField(nn.Module):
         encoded = positional_encoding(positions, self.position_frequencies)
         h = encoded
         for i, layer in enumerate(self.layers):
-            h = torch.cat((encoded, h), dim=1) if i == SKIP_AFTER else h
+            h = torch.cat((encoded, h), dim=1) if i == SKIP_LAYER else h
             h = F.relu(layer(h), inplace=True)
         raw = self.density(h)[:, 0]
         raw = raw if noise is None else raw + noise
         density = F.softplus(raw - 1) if self.softplus else F.relu(raw)
-        return density, torch.sigmoid(self.color(self._view(self.feature(h), directions, ray)))
+        return density, torch.sigmoid(self.color(self._view(self.feature(h), directions, ray_indices)))
 
-    def _view(self, feature: Tensor, directions: Tensor, ray: Tensor | None) -> Tensor:
+    def _view(self, feature: Tensor, directions: Tensor, ray_indices: Tensor | None) -> Tensor:
         """The direction's layer on (feature, encoded direction), its second half computed once a ray."""
         width = feature.shape[1]
         per_ray = F.linear(
             positional_encoding(directions, self.direction_frequencies), self.view.weight[:, width:], self.view.bias
         )
         h = F.linear(feature, self.view.weight[:, :width])
-        if ray is None:
+        if ray_indices is None:
             h = (h.reshape(len(directions), -1, h.shape[1]) + per_ray[:, None]).reshape(h.shape)
         else:
-            h = h + per_ray[ray]
+            h = h + per_ray[ray_indices]
         return F.relu(h, inplace=True)
 
 
 def linear(in_size: int, out_size: int) -> nn.Linear:
-    """A layer still to be initialised; torch's own way would draw from its global generator."""
+    """A layer without initial weights: torch would draw them from its global generator."""
     layer = nn.utils.skip_init(nn.Linear, in_size, out_size)
     assert isinstance(layer, nn.Linear)
     return layer
 
 
-def initialize_all(field: nn.Module, how: str, rng: np.random.Generator) -> None:
-    """Give every layer initial weights, see `initialize`."""
+def initialize_all(field: nn.Module, scheme: str, rng: np.random.Generator) -> None:
+    """Give every linear layer of a module initial weights, see `initialize_linear`."""
     for layer in field.modules():
         if isinstance(layer, nn.Linear):
-            initialize(layer, how, rng)
+            initialize_linear(layer, scheme, rng)
 
 
-def initialize(layer: nn.Linear, how: str, rng: np.random.Generator) -> None:
-    """Fill a layer with seeded initial weights.
+def initialize_linear(layer: nn.Linear, scheme: str, rng: np.random.Generator) -> None:
+    """Draw a layer's initial weights.
 
-    "xavier": uniform in +-sqrt(6 / (in + out)), zero bias, as the original TensorFlow NeRF; "torch": weight and
+    Scheme "xavier": uniform in +-sqrt(6 / (in + out)), zero bias, as the original TensorFlow NeRF; "torch": weight and
     bias uniform in +-1 / sqrt(in), what the PyTorch ports start from.
     """
     out_size, in_size = layer.weight.shape
-    bound = (6 / (in_size + out_size)) ** 0.5 if how == "xavier" else in_size**-0.5
+    bound = (6 / (in_size + out_size)) ** 0.5 if scheme == "xavier" else in_size**-0.5
     with torch.no_grad():
         layer.weight.copy_(torch.from_numpy(rng.uniform(-bound, bound, (out_size, in_size))))
         layer.bias.zero_()
-        if how == "torch":
+        if scheme == "torch":
             layer.bias.copy_(torch.from_numpy(rng.uniform(-bound, bound, out_size)))

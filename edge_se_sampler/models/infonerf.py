@@ -21,6 +21,7 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import InfoNeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.rendering import opacity
+from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 TINY = 1e-10
 
@@ -72,9 +73,11 @@ class InfoNeRFModel(NeRFModel):
 
     config: InfoNeRFModelConfig
 
-    def __init__(self, config: InfoNeRFModelConfig, rng: np.random.Generator) -> None:
-        super().__init__(config, rng)
-        self.num_unseen_rays = config.num_unseen_rays or 0
+    def __init__(
+        self, config: InfoNeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None
+    ) -> None:
+        super().__init__(config, rng, grid)
+        self.num_unseen_rays = config.preset.num_unseen_rays
         self.gain_weight = 0.0
         self.rotation = torch.eye(3)
 

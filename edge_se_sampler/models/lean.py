@@ -1,7 +1,7 @@
-"""The lean model: one small network on features kept where the scene is.
+"""The lean model: one small network on a grid of features, evaluated only where the scene is.
 
-h       side of a cell before any split, world units
-sigma   exp(raw) / h: of its own scale, never 0, so that no network can die
+h       size of a cell at level 0, world units
+sigma   exp(raw) / h, density: independent of the scene's scale, and never 0, so that no network can die
 """
 
 from __future__ import annotations
@@ -30,43 +30,40 @@ from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid, di
 
 RAYS_PER_CHUNK = 4096
 DENSITY_BIAS = -1.0
-"""Raw density at first: thin enough to see the middle of the object, dense enough to have a gradient. In a box of which
-nothing is known it would be an opaque fog: there, the box has an optical depth of 1 across. (Bricks without alpha, seed
-2: after 15 CPU seconds 13.8 and 27.9 dB.)"""
+"""Raw density at first: thin enough to see through the object, dense enough to have a gradient. In an uncarved box it
+would be an opaque fog: there, the box has an optical depth of 1 across."""
 UNCARVED_FRACTION = 0.9
-"""Share of a box's cells from which on nothing is known of it."""
+"""Share of a box's cells in the hull above which the box counts as uncarved: the object may be anywhere."""
 MAX_LOG_DENSITY = 8.0
-"""Raw density above which a cell is opaque whatever it is."""
+"""Raw density above which a cell is opaque anyway."""
 UPDATE_INTERVAL = 128
-"""Steps in which cells are seen long enough to be judged; half as many do as long as they are large. What was seen in
-the first does not count: densities mean nothing yet."""
+"""Steps between prunings: long enough for the cells to be seen. Half as many as long as the cells may be subdivided."""
 ALPHA_THRESHOLD = 0.01
-"""Of the smallest cell that there may be: below, it is taken to be empty."""
+"""Opacity of a cell of the finest level below which it counts as empty."""
 MIN_OPTICAL_DEPTH = 0.5
-"""Optical depth of a cell that holds something, rather than haze. As long as there is none in a box of which nothing
-was known, nothing is learnt, and nothing judged."""
+"""Optical depth above which a cell counts as surface; while no cell of a grid that may be subdivided has it, pruning is
+suspended."""
 REACTIVATION_FRACTION = 0.02
-"""Share of the empty cells that are tried again until the next judgement; half of it after each split, for there are
-eight times as many, and one of them is enough to find what was missed."""
-MISJUDGED = 0.01
-"""Solid cells beside those that were split, as a share of all, from which on they get corners of their own, too."""
+"""Share of the empty cells that are reactivated at each pruning; halved per level, which has eight times the cells."""
+MISSED_FRACTION = 0.01
+"""Share of the surface's cells that are not refined from which on they, too, are refined."""
 
 
 class LeanField(nn.Module):
     """Position, features and direction -> density and colour.
 
     Args:
-        config: resolved, without None.
+        config: resolved.
         rng: of the initial weights.
     """
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator) -> None:
         super().__init__()
-        self.position_frequencies = config.position_frequencies or 0
-        self.direction_frequencies = config.direction_frequencies or 0
-        width, depth = config.width or 0, config.depth or 0
-        first = encoded_size(3, self.position_frequencies) + config.feature_dim
-        self.layers = nn.ModuleList(linear(width if i else first, width) for i in range(depth))
+        preset = config.preset
+        self.position_frequencies = preset.position_frequencies
+        self.direction_frequencies = preset.direction_frequencies
+        width, in_dim = preset.width, encoded_size(3, preset.position_frequencies) + config.feature_dim
+        self.layers = nn.ModuleList(linear(width if i else in_dim, width) for i in range(preset.depth))
         self.density = linear(width, 1)
         self.view = linear(width + encoded_size(3, self.direction_frequencies), width)
         self.color = linear(width, 3)
@@ -98,101 +95,90 @@ class LeanField(nn.Module):
 
 
 class LeanModel(RayModel):
-    """One network, asked in occupied cells alone. `settle` gives it its cells and features.
+    """One network, evaluated in occupied cells alone.
 
     Args:
-        config: resolved, without None.
+        config: resolved.
         rng: of the initial weights.
+        grid: the scene's cells; features lie at their corners. Training prunes and subdivides them.
     """
 
     config: LeanModelConfig
+    grid: OccupancyGrid
 
-    def __init__(self, config: LeanModelConfig, rng: np.random.Generator) -> None:
-        super().__init__(config)
+    def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: OccupancyGrid) -> None:
+        super().__init__(config, grid)
         self.fine = LeanField(config, rng)
-        self.features: FeatureGrid | None = None
-        """None where the network is to do without."""
+        box = grid.static_mask_at(0)[1:-1, 1:-1, 1:-1]  # without the rim
+        if box.float().mean() > UNCARVED_FRACTION:
+            with torch.no_grad():
+                self.fine.density.bias.sub_(math.log(max(box.shape)) + DENSITY_BIAS)
+        self.features = FeatureGrid(grid, config.feature_dim) if config.feature_dim else None
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """The device of the weights."""
         return self.fine.density.weight.device
 
     def chunks(self, rays: int) -> Iterator[slice]:
-        """Rows of that many rays, as many at a time as are worth rendering at once."""
+        """Slices of that many rays, each small enough to be rendered at once."""
         return (slice(start, start + RAYS_PER_CHUNK) for start in range(0, rays, RAYS_PER_CHUNK))
 
-    @property
-    def needs_cells(self) -> bool:
-        """Always: it has features in them."""
-        return True
-
-    def settle(self, grid: OccupancyGrid) -> None:
-        """Features at the corners of the grid's cells, and a density to begin with."""
-        super().settle(grid)
-        inside = grid.possible[1:-1, 1:-1, 1:-1]
-        if inside.float().mean() > UNCARVED_FRACTION:
-            with torch.no_grad():
-                self.fine.density.bias.sub_(math.log(max(inside.shape)) + DENSITY_BIAS)
-        if self.config.feature_dim:
-            self.features = FeatureGrid(grid, self.config.feature_dim).to(self.device, self.dtype)
-
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
-        """The features learn faster: each sees few samples."""
+        """The features learn faster than the network: each sees few samples."""
         if self.features is None:
             return super().parameter_groups()
         return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_lr_scale)]
 
     def begin_step(self, step: int, seed: int) -> None:
-        """As `RayModel`; now and then, cells that have shown no density are left out."""
+        """As `RayModel`; at intervals, prunes and subdivides the grid."""
         super().begin_step(step, seed)
         grid = self.grid
-        if grid is None or not self.config.learns_cells:
+        if not self.config.prunes_cells:
             return
-        large = bool(grid.splits[1])
-        every = UPDATE_INTERVAL // 2 if large else UPDATE_INTERVAL
-        if step < every or step % every:
+        subdivisible = bool(grid.level < grid.max_level)
+        interval = UPDATE_INTERVAL // 2 if subdivisible else UPDATE_INTERVAL
+        if step < interval or step % interval:
             return
-        solid = grid.largest * grid.side > MIN_OPTICAL_DEPTH
-        if step == every or (large and not solid.any()):
-            grid.largest.zero_()
+        surface = grid.max_density * grid.cell_size > MIN_OPTICAL_DEPTH
+        if step == interval or (subdivisible and not surface.any()):  # the first densities mean nothing
+            grid.max_density.zero_()
             return
-        share = REACTIVATION_FRACTION / 2 ** int(grid.splits[0])
-        again = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < share
-        kept = grid.judge(-math.log1p(-ALPHA_THRESHOLD) / float(grid.finest_side), again)
-        self._refine(grid, kept, solid)
+        fraction = REACTIVATION_FRACTION / 2 ** int(grid.level)
+        reactivated = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < fraction
+        dense = grid.prune(-math.log1p(-ALPHA_THRESHOLD) / float(grid.finest_cell_size), reactivated)
+        self._refine(dense, surface)
 
-    def _refine(self, grid: OccupancyGrid, kept: Tensor, solid: Tensor) -> None:
-        """Split the cells that are kept, at first and then once they are few enough; later, see to those left out by
-        mistake.
+    def _refine(self, dense: Tensor, surface: Tensor) -> None:
+        """Subdivide the grid, at level 0 always, later when its cells are few enough; else refine surface cells that
+        pruning had missed.
 
         Args:
-            kept, solid: (X, Y, Z) bool.
+            dense: (X, Y, Z) bool: cells that pruning has kept.
+            surface: (X, Y, Z) bool: cells that count as surface.
         """
-        features = self.features
-        done, left = grid.splits.tolist()
-        if left and (done == 0 or 8 * kept.sum() <= MAX_OCCUPIED_CELLS):
-            grid.split() if features is None else features.own(upsample(kept) & grid.possible_after(done + 1))
-        elif features is not None and done:
-            missed = solid & ~features.owned
-            owned = features.owned | (dilate(missed) & grid.possible)
-            if missed.sum() > MISJUDGED * solid.sum() and owned.sum() <= MAX_OCCUPIED_CELLS:
-                features.own(owned)
+        grid, features, level = self.grid, self.features, int(self.grid.level)
+        if level < grid.max_level and (level == 0 or 8 * dense.sum() <= MAX_OCCUPIED_CELLS):
+            grid.subdivide() if features is None else features.refine(upsample(dense) & grid.static_mask_at(level + 1))
+        elif features is not None and level:
+            missed = surface & ~grid.refined
+            refined = grid.refined | (dilate(missed) & grid.static_mask)
+            if missed.sum() > MISSED_FRACTION * surface.sum() and refined.sum() <= MAX_OCCUPIED_CELLS:
+                features.refine(refined)
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
-        """As `RayModel`."""
+        """As `RayModel`; depth_fine in evaluation alone."""
         grid = self.grid
-        assert grid is not None, "settle comes first"
-        step = self.config.step_size_voxels * float(grid.side)
+        step = self.config.step_size_voxels * float(grid.cell_size)
         jitter = self.uniform(len(rays), 1) if self.training else None
         samples = grid.march(rays, step, jitter, (self.config.near, self.config.far))
         positions = samples.positions
         features = positions[:, :0] if self.features is None else self.features(positions, samples.cell_indices)
-        centered = (positions - grid.middle) / grid.reach
+        centered = (positions - grid.center) / grid.half_extent
         raw, color = self.fine(centered, features, rays.directions, samples.ray_starts, samples.ray_indices)
-        density = torch.exp(raw.clamp(max=MAX_LOG_DENSITY)) / float(grid.first_side)
-        if self.training and self.config.learns_cells:
-            grid.remember(samples, density)
+        density = torch.exp(raw.clamp(max=MAX_LOG_DENSITY)) / float(grid.initial_cell_size)
+        if self.training and self.config.prunes_cells:
+            grid.update_max_density(samples, density)
         rgb, accumulation = render_packed(density, color, step, samples.ray_starts, samples.ray_indices)
         background = self.get_background(rays)
         outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}

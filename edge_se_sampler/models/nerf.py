@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -17,43 +17,39 @@ from edge_se_sampler.models.rendering import composite, intervals, sample_weight
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
-"""Network evaluations rendered at once, by device: it bounds the memory. Each chunk draws its own jitter, so another
-value gives another (equally good) training run."""
+"""Points evaluated at once, by device: bounds the memory. Each chunk draws its own jitter, so another value gives
+another (equally good) training run."""
 
 
 class NeRFModel(RayModel):
     """Coarse and fine networks, stratified and importance samples.
 
     Args:
-        config: resolved, without None.
+        config: resolved.
         rng: of the initial weights.
+        grid: outside of its occupied cells the density is 0, and no network is evaluated; None: everywhere.
     """
 
     networks = ("coarse", "fine")
 
-    def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
-        super().__init__(config)
+    def __init__(self, config: NeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None) -> None:
+        super().__init__(config, grid)
         self.config = config
+        self.num_coarse_samples = config.preset.num_coarse_samples
+        self.num_importance_samples = config.preset.num_importance_samples
         self.coarse = NeRFField(config, rng)
         self.fine = NeRFField(config, rng)
-        self.occupied: Callable[[Tensor], Tensor] | None = None
-        """Positions (m, 3) -> (m,) bool; where False, the density is 0 and no network is asked. None: everywhere."""
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """The device of the weights."""
         return self.coarse.density.weight.device
 
     def chunks(self, rays: int) -> Iterator[slice]:
-        """Rows of that many rays, as many at a time as are worth rendering at once."""
-        points = 2 * (self.config.num_coarse_samples or 0) + (self.config.num_importance_samples or 0)
+        """Slices of that many rays, each small enough to be rendered at once."""
+        points = 2 * self.num_coarse_samples + self.num_importance_samples
         size = max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points)
         return (slice(start, start + size) for start in range(0, rays, size))
-
-    def settle(self, grid: OccupancyGrid) -> None:
-        """Ask both networks only in the grid's cells from now on."""
-        super().settle(grid)
-        self.occupied = grid.contains
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`; and density_fine, delta_fine (n, s) of the fine network's samples."""
@@ -68,23 +64,22 @@ class NeRFModel(RayModel):
         return outputs | fine | dict(zip(("density_fine", "delta_fine"), samples, strict=True))
 
     def coarse_squared_error(self, rays: RayBundle, image: Tensor) -> Tensor:
-        """(n,) `squared_error` of the coarse colours, without asking the fine network."""
+        """(n,) `squared_error` of the coarse colours, without evaluating the fine network."""
         _, _, rgb, background = self._coarse(rays)
         return self.squared_error({"rgb_coarse": rgb, "background": background}, image, "coarse")
 
     def _coarse(self, rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of the coarse network: t and weights of its samples (n, s), colours, and backgrounds (n, 3)."""
-        config, count = self.config, len(rays)
-        samples = config.num_coarse_samples or 0
+        """Render by the coarse network: t and weights of its samples (n, s), colours and backgrounds (n, 3)."""
         norm = rays.metadata["directions_norm"]
-        jitter = self.uniform(count, samples) if self.training else None
-        t = stratified(config.near * norm, config.far * norm, samples, jitter)
+        jitter = self.uniform(len(rays), self.num_coarse_samples) if self.training else None
+        t = stratified(self.config.near * norm, self.config.far * norm, self.num_coarse_samples, jitter)
         background = self.get_background(rays)
         weights, rgb, _ = self._render(self.coarse, rays, t, background)
         return t, weights, rgb, background
 
     def _importance(self, t: Tensor, weights: Tensor) -> Tensor:
-        count = self.config.num_importance_samples or 0
+        """(n, m) further samples where the coarse weights (n, s) of the samples t (n, s) are large."""
+        count = self.num_importance_samples
         if self.training:
             uniform = self.uniform(len(t), count)
         else:
@@ -94,18 +89,18 @@ class NeRFModel(RayModel):
     def _render(
         self, field: NeRFField, rays: RayBundle, t: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """Weights (n, s) and colours (n, 3) of rays sampled at t (n, s), and density and interval of each sample."""
+        """Weights (n, s), colours (n, 3), and (densities, intervals) (n, s) of rays sampled at t (n, s)."""
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
         noise = self._noise(t.numel())
-        if self.occupied is None:
+        if self.grid is None:
             density, color = field(positions, rays.directions, None, noise)
         else:
-            packed = torch.nonzero(self.occupied(positions))[:, 0]
-            ray = torch.div(packed, t.shape[1], rounding_mode="floor")
+            packed = torch.nonzero(self.grid.contains(positions))[:, 0]
+            ray_indices = torch.div(packed, t.shape[1], rounding_mode="floor")
             noise = None if noise is None else noise[packed]
-            some_density, some_color = field(positions[packed], rays.directions, ray, noise)
-            density = t.new_zeros(t.numel()).index_put((packed,), some_density)
-            color = t.new_zeros((t.numel(), 3)).index_put((packed,), some_color)
+            packed_density, packed_color = field(positions[packed], rays.directions, ray_indices, noise)
+            density = t.new_zeros(t.numel()).index_put((packed,), packed_density)
+            color = t.new_zeros((t.numel(), 3)).index_put((packed,), packed_color)
         # a softplus is never 0: over an endless interval it would hide every background
         delta = intervals(t, endless=self.config.density_activation == "relu")
         density = density.reshape(t.shape)

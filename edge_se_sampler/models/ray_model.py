@@ -1,45 +1,48 @@
-"""What every model is to training, evaluation and samplers: rays -> colours and their errors."""
+"""The contract of every model with training, evaluation and samplers: rays -> colours and their errors."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
-from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 
 class RayModel(nn.Module, ABC):
-    """Renders rays; every network of it is one of `networks`, "fine" the one whose colours count."""
+    """Renders rays.
+
+    Args:
+        config: resolved, without None.
+        grid: cells outside of which no network is evaluated; None: there are none.
+    """
 
     networks: tuple[str, ...] = ("fine",)
+    """Names of the networks, each an attribute; the colours of "fine" are the model's."""
     num_unseen_rays = 0
     """Rays a step, of cameras between the training views, that `auxiliary_loss` regularizes."""
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ModelConfig, grid: OccupancyGrid | None) -> None:
         super().__init__()
         self.config = config
-        self.grid: OccupancyGrid | None = None
-        """Where networks are asked; None: everywhere."""
+        self.grid = grid
         self.random = torch.Generator()
-        """Of jitter, noise and random backgrounds; the trainer seeds it at every step."""
+        """Source of jitter, noise and random backgrounds; seeded at every training step."""
         self.background_fn: Callable[[RayBundle], Tensor] | None = None
         """n rays -> (n, 3) background colours in [0, 1], in place of the config's background color."""
 
     @property
     @abstractmethod
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """The device of the weights."""
 
     @abstractmethod
     def chunks(self, rays: int) -> Iterator[slice]:
-        """Rows of that many rays, as many at a time as are worth rendering at once."""
+        """Slices of that many rays, each small enough to be rendered at once."""
 
     @abstractmethod
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
@@ -51,59 +54,26 @@ class RayModel(nn.Module, ABC):
         """
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
-        """Weights, and their learning rate as a multiple of the run's."""
+        """Groups of weights, each with its learning rate as a multiple of the run's."""
         return [(list(self.parameters()), 1.0)]
 
     def begin_step(self, step: int, seed: int) -> None:
-        """Make the randomness of what follows a function of the seed, in a training step (0, 1, 2, ...)."""
+        """Begin training step 0, 1, 2, ...: all that it draws is a function of the seed."""
         if self.random.device != self.device:
             self.random = torch.Generator(self.device)
         self.random.manual_seed(seed)
 
-    @property
-    def needs_cells(self) -> bool:
-        """Whether it is to be settled in the scene's cells before it is trained."""
-        return self.config.empty_space_skipping
-
-    def settle(self, grid: OccupancyGrid) -> None:
-        """Ask networks only in the grid's cells from now on."""
-        self.grid = grid.to(self.device, self.dtype)
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
-        """As torch's; a state with cells settles the model in them.
-
-        Raises:
-            InputError: it is another model's, or the model is settled in other cells: features would lie at other
-                corners.
-        """
-        if "grid.hull" in state_dict:
-            told = {key.removeprefix("grid."): told for key, told in state_dict.items() if key.startswith("grid.")}
-            first, splits = OccupancyGrid.at_first(told)
-            if self.grid is None:
-                self.settle(first)
-            elif not first.is_the_same_as(self.grid):
-                raise InputError(
-                    "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
-                    "this machine rounds otherwise; resume with what it began with, or train anew"
-                )
-            assert self.grid is not None
-            for _ in range(splits):
-                self.grid.split()
-        try:
-            return super().load_state_dict(state_dict, *args, **kwargs)
-        except RuntimeError as problem:
-            raise InputError("the checkpoint's weights are not this model's: another version wrote them") from problem
-
     def squared_error(self, outputs: dict[str, Tensor], image: Tensor, network: str = "fine") -> Tensor:
-        """(n,) squared error of every ray, ||C_hat - C||^2 of equation 1 of the paper.
+        """(n,) squared error of every ray, summed over channels (NeRF, equation 6).
 
         Args:
+            outputs: of `forward`.
             image: (n, 3|4) straight-alpha pixels in [0, 1].
         """
         return (outputs[f"rgb_{network}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """(n,) what training minimises the mean of on a batch's rays, and (n,) the fine colours' squared errors."""
+        """Render n rays: their losses (n,), whose mean is minimised, and the fine network's squared errors (n,)."""
         return self.loss(self(rays), batch)
 
     def auxiliary_loss(self, rays: RayBundle) -> Tensor:
@@ -131,16 +101,16 @@ class RayModel(nn.Module, ABC):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights."""
+        """The floating point type of the weights."""
         return next(self.parameters()).dtype
 
     def uniform(self, rows: int, columns: int) -> Tensor:
-        """(rows, columns) in [0, 1), of the step's randomness."""
+        """(rows, columns) uniform draws in [0, 1) from the step's generator."""
         return torch.rand((rows, columns), generator=self.random, device=self.device, dtype=self.dtype)
 
 
 def target_colors(image: Tensor, background: Tensor) -> Tensor:
-    """What a ray should show: (n, 3|4) straight-alpha pixels composited on (n, 3) backgrounds."""
+    """The colours (n, 3) that rays should have: pixels (n, 3|4), straight alpha, composited on backgrounds (n, 3)."""
     if image.shape[1] == 3:
         return image
     return image[:, :3] * image[:, 3:] + background * (1 - image[:, 3:])

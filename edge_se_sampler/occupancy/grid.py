@@ -1,6 +1,6 @@
-"""Which cells of a box are worth asking the network about, and the samples of rays in them, packed.
+"""The cells of a box in which networks are evaluated, and the samples of rays in them, packed.
 
-h      side of a cell, world units
+h      size of a cell: its edge, world units
 n      rays
 m      samples, of all rays one after the other; sample i lies on ray ray_indices[i], ascending
 t      distance of a sample from its ray's origin, world units
@@ -20,13 +20,12 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.occupancy.hull import Hull
 
 MAX_OCCUPIED_CELLS = 2**18
-"""More cost more than they tell: with four times as many, bricks at 400 pixels ends after 100 CPU seconds at 33.14 dB,
-not 34.41."""
+"""More cost more time than they are worth in detail."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Where n rays are to be evaluated."""
+    """Where n rays are evaluated."""
 
     t: Tensor
     """(m,)."""
@@ -41,105 +40,117 @@ class Samples:
 
 
 class OccupancyGrid(nn.Module):
-    """Cells of a box; those outside the hull are empty for ever, those inside as long as no density is seen there.
+    """Cubic cells of a box: those outside the hull are empty for good, of the others training prunes those without
+    density.
 
-    Its state has the cells themselves: a checkpoint needs no images to be rendered.
+    Its state holds the cells themselves: a checkpoint is rendered without the images that the hull was carved from.
 
     Args:
-        corner: (3,) world units: where the box has its least coordinates.
-        side: h.
-        hull: (X, Y, Z) bool: what may hold something, in cells of h, or its half, its quarter, ...; none of the grid's
-            outermost cells.
-        splits: how often the grid's cells may be upsample along every axis.
-        coarser: how often the hull's cells have to be doubled to be the grid's.
+        aabb_min: (3,) world units: the box's least coordinates.
+        cell_size: h.
+        hull: (X, Y, Z) bool: cells of h / 2^coarsening that may hold something; none of the grid's outermost cells.
+        max_level: how often the grid's cells may be subdivided.
+        coarsening: how often the hull's cells are doubled to be the grid's.
     """
 
-    corner: Tensor
-    side: Tensor
+    aabb_min: Tensor
+    cell_size: Tensor
     hull: Tensor
     occupied: Tensor
-    largest: Tensor
-    """(X, Y, Z) density seen in each cell since the last judgement."""
-    splits: Tensor
-    """(2,) int64: how often cells have been split, and how often they still may be."""
+    """(X, Y, Z) bool: cells in which networks are evaluated."""
+    max_density: Tensor
+    """(X, Y, Z) largest density seen in each cell since the last pruning."""
+    refined: Tensor
+    """(X, Y, Z) bool: cells with features of their own level, see `FeatureGrid`."""
+    level: Tensor
+    """() int64: how often the cells have been subdivided, 0 .. max_level."""
+    max_level: Tensor
+    """() int64."""
 
-    def __init__(self, corner: Tensor, side: float, hull: Tensor, splits: int = 0, coarser: int = 0) -> None:
+    def __init__(
+        self, aabb_min: Tensor, cell_size: float, hull: Tensor, max_level: int = 0, coarsening: int = 0
+    ) -> None:
         super().__init__()
-        shape = [size // 2**coarser for size in hull.shape]
-        self.register_buffer("corner", corner.float())
-        self.register_buffer("side", torch.tensor(side, dtype=torch.float32))
+        shape = [size // 2**coarsening for size in hull.shape]
+        self.register_buffer("aabb_min", aabb_min.float())
+        self.register_buffer("cell_size", torch.tensor(cell_size, dtype=torch.float32))
         self.register_buffer("hull", hull.clone())
         self.register_buffer("occupied", resample(hull, shape[0]))
-        self.register_buffer("largest", torch.zeros(shape))
-        self.register_buffer("splits", torch.tensor((0, splits)))
+        self.register_buffer("max_density", torch.zeros(shape))
+        self.register_buffer("refined", torch.zeros(shape, dtype=torch.bool))
+        self.register_buffer("level", torch.tensor(0))
+        self.register_buffer("max_level", torch.tensor(max_level))
 
     @classmethod
-    def of(cls, hull: Hull, splits: int = 0, coarser: int = 0) -> OccupancyGrid:
-        """The hull's cells, or so much larger ones that have any of them, all occupied, with an empty rim: what
-        rounding puts outside of the box is in none."""
-        rim = 2**coarser
+    def from_hull(cls, hull: Hull, max_level: int = 0, coarsening: int = 0) -> OccupancyGrid:
+        """The hull's cells, or 2^coarsening times as large ones that hold any of them; all occupied, with an empty rim
+        for what rounding puts outside the box."""
+        rim = 2**coarsening
         ends = [rim + -size % rim for size in reversed(hull.cells.shape)]
         cells = F.pad(torch.from_numpy(hull.cells), [size for end in ends for size in (rim, end)])
-        return cls(torch.from_numpy(hull.corner - rim * hull.side), rim * hull.side, cells, splits, coarser)
-
-    @property
-    def first_side(self) -> Tensor:
-        """h before any split."""
-        return self.side * 2 ** self.splits[0]
-
-    @property
-    def finest_side(self) -> Tensor:
-        """h after the last split that there may be."""
-        return self.side / 2 ** self.splits[1]
-
-    @property
-    def possible(self) -> Tensor:
-        """(X, Y, Z) bool: cells that have anything of the hull."""
-        return self.possible_after(int(self.splits[0]))
-
-    def possible_after(self, splits: int) -> Tensor:
-        """The same when they have been split so often, since the first."""
-        return resample(self.hull, (len(self.occupied) << splits) >> int(self.splits[0]))
+        return cls(torch.from_numpy(hull.corner - rim * hull.side), rim * hull.side, cells, max_level, coarsening)
 
     @classmethod
-    def at_first(cls, state: Mapping[str, Tensor]) -> tuple[OccupancyGrid, int]:
-        """What the grid of a state was before any judgement, and how often its cells have been split since."""
-        done, left = state["splits"].tolist()
-        coarser = (len(state["hull"]) * 2**done // len(state["occupied"])).bit_length() - 1
-        return cls(state["corner"], float(state["side"]) * 2**done, state["hull"], done + left, coarser), done
+    def from_state(cls, state: Mapping[str, Tensor]) -> OccupancyGrid:
+        """The grid whose `state_dict` that is."""
+        grid = cls(state["aabb_min"], float(state["cell_size"]), state["hull"])
+        for name in grid.state_dict():
+            setattr(grid, name, state[name].clone())
+        return grid
 
-    def is_the_same_as(self, other: OccupancyGrid) -> bool:
-        """Whether both have the same cells, split as often."""
-        told = ("corner", "side", "hull", "splits")
-        same = self.occupied.shape == other.occupied.shape
-        return same and all(torch.equal(getattr(self, key).cpu(), getattr(other, key).cpu()) for key in told)
+    @property
+    def initial_cell_size(self) -> Tensor:
+        """h at level 0."""
+        return self.cell_size * 2**self.level
 
-    def split(self) -> None:
+    @property
+    def finest_cell_size(self) -> Tensor:
+        """h at the highest level."""
+        return self.initial_cell_size / 2**self.max_level
+
+    @property
+    def static_mask(self) -> Tensor:
+        """(X, Y, Z) bool: cells that hold any of the hull; the others are never occupied."""
+        return self.static_mask_at(int(self.level))
+
+    def static_mask_at(self, level: int) -> Tensor:
+        """The static mask when the cells have been subdivided so often."""
+        return resample(self.hull, (len(self.occupied) << level) >> int(self.level))
+
+    def is_of_the_same_scene(self, other: OccupancyGrid) -> bool:
+        """Whether both began with the same cells, whatever has been pruned and subdivided since."""
+        begun = [
+            (grid.aabb_min, grid.initial_cell_size, grid.hull, grid.max_level, grid.static_mask_at(0))
+            for grid in (self, other)
+        ]
+        return all(torch.equal(one.cpu(), another.cpu()) for one, another in zip(*begun, strict=True))
+
+    def subdivide(self) -> None:
         """Halve all cells along every axis."""
-        self.occupied = upsample(self.occupied) & self.possible_after(int(self.splits[0]) + 1)
-        self.largest = upsample(self.largest)
-        self.side = self.side / 2
-        self.splits = self.splits + torch.tensor((1, -1), device=self.splits.device)
+        self.occupied = upsample(self.occupied) & self.static_mask_at(int(self.level) + 1)
+        self.max_density, self.refined = upsample(self.max_density), upsample(self.refined)
+        self.cell_size = self.cell_size / 2
+        self.level = self.level + 1
 
     @property
-    def middle(self) -> Tensor:
-        """(3,) of the box."""
-        return self.corner + self.side * torch.tensor(self.occupied.shape, device=self.corner.device) / 2
+    def center(self) -> Tensor:
+        """(3,) the box's center, world units."""
+        return self.aabb_min + self.cell_size * torch.tensor(self.occupied.shape, device=self.aabb_min.device) / 2
 
     @property
-    def reach(self) -> Tensor:
-        """Half the longest edge of the box."""
-        return self.side * max(self.occupied.shape) / 2
+    def half_extent(self) -> Tensor:
+        """Half the box's longest edge, world units."""
+        return self.cell_size * max(self.occupied.shape) / 2
 
     def locate(self, positions: Tensor) -> Tensor:
-        """(m, 3) world units -> (m,) int64 number of the cell; the rim's where it is outside of the box."""
-        at = (positions - self.corner) / self.side
+        """(m, 3) world units -> (m,) int64 flat index of the cell; one of the rim's where outside the box."""
+        at = (positions - self.aabb_min) / self.cell_size
         size = torch.tensor(self.occupied.shape, device=at.device)
         at = torch.minimum(at.floor().long().clamp(min=0), size - 1)
         return (at[:, 0] * size[1] + at[:, 1]) * size[2] + at[:, 2]
 
     def contains(self, positions: Tensor) -> Tensor:
-        """(m,) bool: positions (m, 3) in occupied cells."""
+        """(m,) bool: whether positions (m, 3) are in occupied cells."""
         return self.occupied.reshape(-1)[self.locate(positions)]
 
     def march(
@@ -149,8 +160,8 @@ class OccupancyGrid(nn.Module):
 
         Args:
             step: world units.
-            jitter: (n, 1) in [0, 1): where in the first step a ray begins; None: in its middle.
-            depths: least and greatest along the camera's axis, world units.
+            jitter: (n, 1) in [0, 1): share of a step before the first sample; None: half a step.
+            depths: near and far along the camera's axis, world units.
         """
         norm = rays.metadata["directions_norm"]
         begin, end = self._span(rays)
@@ -159,65 +170,69 @@ class OccupancyGrid(nn.Module):
         count = int(np.ceil(longest / step)) + 1
         t = begin + (torch.arange(count, device=begin.device) + (0.5 if jitter is None else jitter)) * step
         inside = t < end
-        within = torch.minimum(t, end)  # beyond, cell numbers would mean nothing
+        within = torch.minimum(t, end)  # beyond the end, cell indices would overflow
         cell = torch.zeros(t.shape, dtype=torch.int64, device=t.device)
-        origin, direction = (rays.origins - self.corner) / self.side, rays.directions / self.side
+        origin, direction = (rays.origins - self.aabb_min) / self.cell_size, rays.directions / self.cell_size
         for axis, size in enumerate(self.occupied.shape):
             at = torch.addcmul(origin[:, axis : axis + 1], within, direction[:, axis : axis + 1])
             cell = cell * size + at.long().clamp_(0, size - 1)
         inside &= self.occupied.reshape(-1)[cell]
         packed = torch.nonzero(inside.reshape(-1))[:, 0]
-        ray = torch.div(packed, count, rounding_mode="floor")
-        number = inside.sum(dim=1)
+        ray_indices = torch.div(packed, count, rounding_mode="floor")
+        counts = inside.sum(dim=1)
         t = t.reshape(-1)[packed]
-        positions = torch.addcmul(rays.origins[ray], t[:, None], rays.directions[ray])
-        return Samples(t, ray, number.cumsum(0) - number, positions, cell.reshape(-1)[packed])
+        positions = torch.addcmul(rays.origins[ray_indices], t[:, None], rays.directions[ray_indices])
+        return Samples(t, ray_indices, counts.cumsum(0) - counts, positions, cell.reshape(-1)[packed])
 
     def _span(self, rays: RayBundle) -> tuple[Tensor, Tensor]:
-        """Where rays enter and leave the box, (n, 1) each; the end is not after the beginning for those that miss."""
-        far = self.corner + self.side * torch.tensor(self.occupied.shape, device=self.corner.device)
+        """Distances at which rays enter and leave the box, (n, 1) each; a ray that misses leaves before it enters."""
+        far = self.aabb_min + self.cell_size * torch.tensor(self.occupied.shape, device=self.aabb_min.device)
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
-        one, other = (self.corner - rays.origins) * inverse, (far - rays.origins) * inverse
+        one, other = (self.aabb_min - rays.origins) * inverse, (far - rays.origins) * inverse
         begin = torch.minimum(one, other).amax(dim=1, keepdim=True).clamp(min=0)
         return begin, torch.maximum(one, other).amin(dim=1, keepdim=True)
 
     @torch.no_grad()
-    def remember(self, samples: Samples, density: Tensor) -> None:
-        """Take note of the densities (m,) that training has seen, the largest of each cell."""
-        self.largest.view(-1).scatter_reduce_(0, samples.cell_indices, density.detach(), "amax")
-
-    @torch.no_grad()
-    def judge(self, empty: float, again: Tensor) -> Tensor:
-        """Occupied are from now on the cells where a density above `empty` was seen since the last judgement, their
-        neighbours, so that a surface may move, and those to be tried again.
+    def update_max_density(self, samples: Samples, density: Tensor) -> None:
+        """Keep the largest density seen in each cell.
 
         Args:
-            again: (X, Y, Z) bool: cells to be tried whatever was seen.
+            density: (m,) of the samples.
+        """
+        self.max_density.view(-1).scatter_reduce_(0, samples.cell_indices, density.detach(), "amax")
+
+    @torch.no_grad()
+    def prune(self, min_density: float, reactivated: Tensor) -> Tensor:
+        """Keep occupied only cells where more than min_density was seen since the last pruning, their neighbours (a
+        surface may move), and those to be reactivated.
+
+        Args:
+            reactivated: (X, Y, Z) bool: cells that are occupied whatever was seen.
 
         Returns:
-            (X, Y, Z) bool: the cells that are not occupied for a trial alone.
+            (X, Y, Z) bool: the cells that are occupied for what was seen.
         """
-        near = dilate(self.largest > empty)
-        self.occupied.copy_((near | again) & self.possible)
-        self.largest.zero_()
-        return near & self.possible
+        dense = dilate(self.max_density > min_density) & self.static_mask
+        self.occupied.copy_(dense | (reactivated & self.static_mask))
+        self.max_density.zero_()
+        return dense
 
 
 def dilate(cells: Tensor) -> Tensor:
-    """Cells (X, Y, Z) bool, and the 26 around each; none of them in the outermost."""
+    """(X, Y, Z) bool: cells and the 26 around each; the outermost must be empty."""
     for axis in range(3):
         cells = cells | cells.roll(1, axis) | cells.roll(-1, axis)
     return cells
 
 
 def upsample(cells: Tensor) -> Tensor:
-    """(X, Y, Z) -> (2 X, 2 Y, 2 Z): each cell's value for its eight parts."""
+    """(X, Y, Z) -> (2 X, 2 Y, 2 Z): every cell's value in its eight parts."""
     return cells.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
 
 
 def resample(cells: Tensor, length: int) -> Tensor:
-    """(X, Y, Z): the same space in cells of another size, `length` of them along x: parts of each; or, of bool, those
-    that have any of them."""
+    """(X, Y, Z) -> the same box in cells of another size, `length` of them along x: smaller ones have the value of the
+    cell around them; larger ones, of bool alone, are true where any of their parts is."""
     while len(cells) < length:
         cells = upsample(cells)
     while len(cells) > length:

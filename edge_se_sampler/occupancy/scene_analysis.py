@@ -12,7 +12,6 @@ import torch
 
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import LeanModelConfig, ModelConfig
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
 from edge_se_sampler.occupancy.hull import (
     IN_FRONT,
@@ -31,8 +30,8 @@ MAX_GRID_CELLS = 2**24
 """Cells of the box around them, which grids have a number for, occupied or not."""
 TOLERATED = 0.01
 """Share of the foreground's pixels that may meet no cell, by stray ones."""
-COARSER = 1
-"""How often a hull's cells are doubled where training is to split them."""
+COARSENING = 1
+"""How often a carved hull's cells are doubled where training subdivides them."""
 LOOKED_AT = 4096
 ROUGH = 64
 """Cells along the box of a first hull, which tells how many finer ones there will be."""
@@ -49,32 +48,35 @@ class SceneAnalysis:
     """Views whose alpha tells the object from the background."""
     hull: Hull
     """The cells that may hold something."""
-    coarser: int
-    """How often their sides are doubled for training to begin with."""
-    splits: int
-    """How often training may halve them, where it finds something."""
+    coarsening: int
+    """How often these cells are doubled for training to begin with."""
+    max_level: int
+    """How often training may subdivide them."""
 
     def grid(self) -> OccupancyGrid:
-        """The cells, as training begins with them."""
-        return OccupancyGrid.of(self.hull, self.splits, self.coarser)
+        """The cells with which training begins."""
+        return OccupancyGrid.from_hull(self.hull, self.max_level, self.coarsening)
 
 
-def analyze_scene(views: Views, config: ModelConfig) -> SceneAnalysis:
-    """Derive what training views need under a resolved config.
+def analyze_scene(
+    views: Views, *, near: float, far: float, voxel_size_px: float, by_alpha: bool, prunable: bool
+) -> SceneAnalysis:
+    """Derive the cells of a scene from its training views.
 
-    Where training is to tell which cells are empty, it begins with large ones: of the hull, twice as large; where
-    nothing is carved away, few enough for each to be split.
+    Args:
+        near, far: depths between which rays are sampled, world units.
+        voxel_size_px: size of a cell, in footprints of a pixel.
+        by_alpha: whether the visual hull is carved from alpha.
+        prunable: whether training prunes cells. It then begins with larger ones, to subdivide those that stay: twice as
+            large as a carved hull's; in an uncarved box, as large as lets all be subdivided once.
 
     Raises:
         InputError: the cameras see nothing of what they look at.
     """
-    lean = config if isinstance(config, LeanModelConfig) else None
-    by_alpha = config.empty_space_skipping and (lean is None or lean.cull_by_alpha)
-    learns = lean is not None and lean.learns_cells
-    at_first = MAX_OCCUPIED_CELLS // 8 if learns else MAX_OCCUPIED_CELLS
-    box = box_of(views, config.near, config.far)
+    at_first = MAX_OCCUPIED_CELLS // 8 if prunable else MAX_OCCUPIED_CELLS
+    box = box_of(views, near, far)
     pixel = footprint(views, box)
-    side = config.voxel_size_px * pixel
+    side = voxel_size_px * pixel
     shown = silhouettes(views) if by_alpha else {}
     hull = _hull(views, shown, box, side, MAX_OCCUPIED_CELLS if shown else at_first)
     if shown and (hull is None or _missed(views, shown, hull) > TOLERATED):
@@ -89,12 +91,13 @@ def analyze_scene(views: Views, config: ModelConfig) -> SceneAnalysis:
             "no training view sees anything of what lies between --pipeline.model.near and far around "
             f"({', '.join(f'{x:.2f}' for x in box.middle)}): check the cameras' poses and principal points"
         )
-    coarser = COARSER if learns and shown else 0
-    return SceneAnalysis(box, pixel, len(shown), hull, coarser, coarser or (_splits(hull, side) if learns else 0))
+    coarsening = COARSENING if prunable and shown else 0
+    max_level = coarsening or (_max_level(hull, side) if prunable else 0)
+    return SceneAnalysis(box, pixel, len(shown), hull, coarsening, max_level)
 
 
-def _splits(hull: Hull, side: float) -> int:
-    """How often cells are to be upsample to come to a side; no more often than there are numbers for them."""
+def _max_level(hull: Hull, side: float) -> int:
+    """How often the hull's cells are to be subdivided to have that size, as far as the grid does not get too large."""
     wanted, possible = np.log2(hull.side / side), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3
     return max(0, int(min(np.round(wanted), np.floor(possible))))
 
@@ -112,7 +115,7 @@ def _missed(views: Views, shown: dict[int, Silhouette], hull: Hull) -> float:
     """Share of the foreground's pixels, or of some of them, whose ray meets no cell."""
     some = spread_pixels({i: views.images[i][..., 3] > 0 for i in shown}, LOOKED_AT)
     rays = views.cameras.to(dtype=torch.float32).pixel_rays(some)
-    met = OccupancyGrid.of(hull).march(rays, hull.side / 4, None).ray_indices
+    met = OccupancyGrid.from_hull(hull).march(rays, hull.side / 4, None).ray_indices
     return 1 - len(met.unique()) / len(some)
 
 
