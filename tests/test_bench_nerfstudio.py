@@ -1,36 +1,46 @@
-"""The bench inside nerfstudio, as far as it can be tested without it: what counts as a failure, and what is kept."""
+"""`bench nerfstudio`, as far as it can be tested without nerfstudio: its report."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
-import pytest
-
-from edge_se_sampler.bench.nerfstudio import _begun, _failures
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.bench.nerfstudio.report import describe, tables
 
 
-def run(method: str, psnr: float, share: float) -> dict:
-    return {"method": method, "psnr": psnr, "background_psnr": 20.0, "foreground_share": share}
+def run(method: str, seed: int, psnr: float, outcome: str) -> dict[str, Any]:
+    return {"method": method, "seed": seed, "psnr": psnr, "outcome": outcome}
 
 
-def test_failures_are_counted_by_kind() -> None:
-    runs = [
-        run("vanilla-nerf", 20.0, 1.0),  # nothing but background
-        run("vanilla-nerf", 20.4, 0.8),  # on its way, but no better than the background yet
-        run("vanilla-nerf", 20.6, 0.8),
-        run("vanilla-nerf", 20.6, 0.95),  # a better background, and no object
-        run("edge-se-nerf", 25.0, 0.2),
-    ]
-    told = _failures(runs)
-    assert told["vanilla-nerf"] == {"runs": 4, "at_background": 2, "failed": 3, "mean_psnr": pytest.approx(20.4)}
-    assert told["edge-se-nerf"] == {"runs": 1, "at_background": 0, "failed": 0, "mean_psnr": 25.0}
+def write_result(folder: Path, **more: Any) -> None:
+    result: dict[str, Any] = {
+        "command": "edge-se bench nerfstudio",
+        "settings": {"scene": "chair", "iterations": 10, "rays": 8, "samples": 4, "nerfstudio": "1.1.5"},
+        "machine": {"processor": "p", "cores": 2, "threads": 1, "python": "3", "torch": "2", "numpy": "2"},
+        "runs": [
+            run("vanilla-nerf", 0, 20.0, "collapsed"),
+            run("vanilla-nerf", 1, 20.4, "underfit"),
+            run("vanilla-nerf", 2, 20.8, "converged"),
+            run("edge-se-nerf", 0, 25.0, "converged"),
+        ],
+    }
+    (folder / "result.json").write_text(json.dumps(result | more))
 
 
-def test_a_result_of_other_settings_is_neither_continued_nor_overwritten(tmp_path: Path) -> None:
-    path = tmp_path / "result.json"
-    path.write_text(json.dumps({"settings": {"offset": [0.2, 0.1]}, "runs": [1]}))
-    assert _begun(path, {"offset": (0.2, 0.1)})["runs"] == [1]
-    with pytest.raises(InputError, match=r"result.json: is of other settings"):
-        _begun(path, {"offset": (0.3, 0.1)})
+def test_failures_are_counted_by_method(tmp_path: Path) -> None:
+    write_result(tmp_path)
+    failures = tables(tmp_path)["failures"]
+    assert "uniform pixels | 2 of 3 | 1 | 20.40 dB |" in failures
+    assert "Edge + SE | 0 of 1 | 0 | 25.00 dB |" in failures
+
+
+def test_costs_are_ratios_to_uniform_pixels(tmp_path: Path) -> None:
+    write_result(tmp_path)
+    assert "What a step costs" not in describe(tmp_path)
+    medians = {
+        "edge-se-nerf uniform": {"seconds": 2.0, "bytes": 100},
+        "edge-se-nerf se": {"seconds": 3.0, "bytes": 110},
+    }
+    write_result(tmp_path, costs={"rays": 256, "medians": medians})
+    assert "| `edge-se-nerf` | 1.50 | 1.10 |" in describe(tmp_path)

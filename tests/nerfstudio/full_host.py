@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from edge_se_sampler.bench.nerfstudio import host_config, host_trainer
+from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer
 
 RAYS = 33
 """Odd, and no divisor of anything."""
@@ -29,7 +29,7 @@ def config_of(
     """
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
-    config = host_config(name, 42, scene, runs)
+    config = build_config(name, 42, scene, runs)
     config.machine.device_type = "cpu"
     config.max_num_iterations = PLANNED
     manager, model = config.pipeline.datamanager, config.pipeline.model
@@ -47,7 +47,7 @@ def config_of(
 
 def trainer_of(config: Any) -> Any:
     """nerfstudio's trainer, set up as `ns-train` does."""
-    return host_trainer(config, "val")
+    return build_trainer(config, "val")
 
 
 def max_num_iterations(start: int, more: int) -> int:

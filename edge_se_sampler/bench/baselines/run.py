@@ -200,16 +200,16 @@ def _nerfstudio(task: Task, folder: Path, clock: Clock) -> None:
     """A method of nerfstudio's as ns-train has it."""
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    from edge_se_sampler.bench.nerfstudio import host_config, host_trainer, rendered_views
+    from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
 
     method, flags = task.settings.program.removeprefix("nerfstudio-"), shlex.split(task.settings.flags)
-    config = host_config(method, task.seed, task.data, folder, flags)
+    config = build_config(method, task.seed, task.data, folder, flags)
     clock.start()
-    trainer = host_trainer(config, "test")
+    trainer = build_trainer(config, "test")
 
     def evaluate(step: int) -> None:
         del step
-        clock.after_step(lambda: mean_psnr(rendered_views(trainer), task.data))
+        clock.after_step(lambda: mean_psnr(render_test_views(trainer), task.data))
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], evaluate))
     trainer.train()

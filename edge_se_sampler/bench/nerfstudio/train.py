@@ -1,0 +1,131 @@
+"""Trainings and timed steps inside nerfstudio: its own pixel sampler against Edge + SE.
+
+nerfstudio's vanilla NeRF has a softplus density, torch's initial weights and RAdam; the two methods differ in their
+data managers alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edge_se_sampler.bench.machine import resident_memory
+from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
+from edge_se_sampler.bench.outcomes import measure_outcome
+from edge_se_sampler.bench.runner import run_in_subprocess
+from edge_se_sampler.bench.timing import time_interleaved
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.engine.metrics import compute_metrics
+from edge_se_sampler.engine.rendering import to_pictures
+
+METHODS = ("vanilla-nerf", "edge-se-nerf")
+SCENE_OPTIONS = {
+    "size": 64, "num_train": 30, "num_val": 1, "num_test": 3, "placement": "shifted", "offset": (0.2, 0.15),
+}  # fmt: skip
+RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
+COST_METHODS = ("edge-se-nerf", "edge-se-nerfacto")
+COST_RAYS, COST_STEPS, COST_ROUNDS = 256, 8, 3
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What is trained, by which nerfstudio."""
+
+    scene: str
+    iterations: int
+    rays: int
+    """Pixels per step."""
+    samples: int
+    """Coarse samples per ray, and as many importance samples."""
+    nerfstudio: str
+    """Its version."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training."""
+
+    method: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """For the terminal."""
+        return f"{self.method}, seed {self.seed}"
+
+
+def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: Path) -> dict[str, Any]:
+    """Train once and measure the test views: seconds, cpu_seconds, psnr, and those of `measure_outcome`."""
+    config = build_config(trial.method, trial.seed, data, workplace / "runs", [RAYS, str(settings.rays)])
+    config.max_num_iterations = settings.iterations
+    config.pipeline.model.num_coarse_samples = config.pipeline.model.num_importance_samples = settings.samples
+    with _silent(workplace):
+        trainer = build_trainer(config, "test")
+        start, cpu_start = time.monotonic(), time.process_time()
+        trainer.train()
+        seconds, cpu_seconds = time.monotonic() - start, time.process_time() - cpu_start
+        views = render_test_views(trainer)
+    pictures = to_pictures(read_blender(data, "test"))
+    images = [compute_metrics(view, picture.image, 1.0) for view, picture in zip(views, pictures, strict=True)]
+    results = {"psnr": statistics.mean(image["psnr"] or 0.0 for image in images), "images": images}
+    return {
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "psnr": results["psnr"],
+        **measure_outcome(results, pictures, 1.0),
+    }
+
+
+def measure_costs(data: Path, workplace: Path) -> dict[str, Any]:
+    """What a late step costs whose pixels are uniform, or chosen by squared error.
+
+    Returns:
+        `rays` per step and `medians`: "METHOD uniform|se" -> seconds per step, and peak resident bytes above the level
+        after set-up, in fresh processes that take turns.
+    """
+    cases = [(method, late) for method in COST_METHODS for late in ("uniform", "se")]
+    costs: dict[str, list[dict[str, float]]] = defaultdict(list)
+    for _ in range(COST_ROUNDS):
+        for method, late in cases:
+            costs[f"{method} {late}"].append(run_in_subprocess(_measure_step, method, late, data, workplace))
+    medians = {
+        case: {key: statistics.median(cost[key] for cost in repeated) for key in ("seconds", "bytes")}
+        for case, repeated in costs.items()
+    }
+    return {"rays": COST_RAYS, "medians": medians}
+
+
+def _measure_step(method: str, late: str, data: Path, workplace: Path) -> dict[str, float]:
+    config = build_config(method, 0, data, workplace / "runs", [RAYS, str(COST_RAYS)])
+    sampler = config.pipeline.datamanager.pixel_sampler
+    sampler.early, sampler.late, sampler.early_fraction = "uniform", late, 0.0
+    with _silent(workplace):
+        trainer = build_trainer(config, "test")
+
+        def train_step(step: int) -> None:
+            for callback in trainer.callbacks:
+                callback.func(step=step)
+            trainer.train_iteration(step)
+
+        before = resident_memory()
+        (seconds,) = time_interleaved({"step": train_step}, COST_STEPS, warmup=0).values()
+    return {"seconds": statistics.median(seconds), "bytes": resident_memory("VmHWM") - before}
+
+
+@contextlib.contextmanager
+def _silent(workplace: Path) -> Iterator[None]:
+    """What nerfstudio prints goes to a log in the workplace; its warnings go nowhere."""
+    with (
+        open(workplace / "nerfstudio.log", "a") as log,
+        contextlib.redirect_stdout(log),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        yield
