@@ -1,0 +1,99 @@
+"""Imports inside the package: no circles, and only in the order of its layers."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "edge_se_sampler"
+ROOT = Path(__file__).parent.parent / PACKAGE
+LAYERS = [
+    ("errors", "protocol"),
+    ("sampling",),
+    ("",),  # the package itself: the public API
+    ("data",),
+    ("occupancy",),
+    ("models",),
+    ("engine",),
+    ("methods",),
+    ("nerfstudio", "bench"),
+    ("commands",),
+    ("cli",),
+]
+"""Files and folders of the package. Each may import from its own layer and from earlier ones."""
+
+
+def module_name(path: Path, root: Path) -> str:
+    """Dotted name within the package; the package itself is ""."""
+    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix("__init__").removesuffix(".")
+
+
+def imports(root: Path) -> dict[str, set[str]]:
+    """Module -> modules of the package that it imports anywhere: at its top, for types only, or within functions."""
+    paths = {module_name(path, root): path for path in sorted(root.rglob("*.py"))}
+    return {name: set(_imported(path, paths)) - {name} for name, path in paths.items()}
+
+
+def _imported(path: Path, modules: dict[str, Path]) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}: a relative import"
+            # from a.b import c: c is a module, or a name in the module a.b
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if _inside(name) in modules else node.module for name in names]
+        else:
+            continue
+        yield from (_inside(name) for name in names if name and name.split(".")[0] == PACKAGE)
+
+
+def _inside(name: str | None) -> str:
+    return (name or "").removeprefix(PACKAGE).removeprefix(".")
+
+
+def circle(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle; none: empty."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def upward(graph: dict[str, set[str]]) -> list[str]:
+    """Imports from a later layer."""
+    layer = {name: number for number, names in enumerate(LAYERS) for name in names}
+    return [
+        f"{module} imports {imported}"
+        for module, names in graph.items()
+        for imported in sorted(names)
+        if layer[module.split(".")[0]] < layer[imported.split(".")[0]]
+    ]
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    assert circle(imports(ROOT)) == []
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"from {PACKAGE}.engine import trainer",
+        f"import {PACKAGE}.engine.trainer",
+        f"from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {PACKAGE}.engine.trainer import Trainer",
+        f"def late():\n    from {PACKAGE}.engine.trainer import Trainer",
+    ],
+)
+def test_a_forbidden_import_is_found_wherever_it_stands(statement: str, tmp_path: Path) -> None:
+    (tmp_path / "engine").mkdir()
+    (tmp_path / "engine" / "trainer.py").write_text(f"import {PACKAGE}.protocol\nclass Trainer: ...\n")
+    (tmp_path / "protocol.py").write_text(statement)
+    assert set(circle(imports(tmp_path))) == {"protocol", "engine.trainer"}
+    assert upward(imports(tmp_path)) == ["protocol imports engine.trainer"]
+    (tmp_path / "protocol.py").write_text("import engine.trainer, torch\n")  # other packages are of no concern
+    assert circle(imports(tmp_path)) == upward(imports(tmp_path)) == []
