@@ -109,7 +109,7 @@ BAD_ARGUMENTS = [
     pytest.param({"placement": "shifted", "offset": (math.nan, 0)}, "offset.*finite", id="offset nan"),
     pytest.param(
         {"names": ["hotdog"], "placement": "rotated", "offset": (0.3, 0.3)},
-        "offset rotates hotdog out.*train/r_0",
+        "offset rotates hotdog to the edge.*train/r_0",
         id="clipped",
     ),
 ]

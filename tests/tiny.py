@@ -1,4 +1,4 @@
-"""A tiny NeRF, a model's grid, rays through its sampled shell, views of random pixels, and a tiny training's flags."""
+"""Small fixtures: a NeRF that is evaluated in no time, rays and views to train it on, flags of a short training."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ SMALL = (
     "--pipeline.model.num-coarse-samples", "8", "--pipeline.model.num-importance-samples", "8",
     "--machine.device-type", "cpu",
 )  # fmt: skip
-"""Flags of a training that takes a moment."""
+"""Flags of a training of six steps."""
 
 
 def tiny_config(**changes: Any) -> NeRFModelConfig:
-    """A resolved config of a network that is evaluated in no time."""
+    """A resolved config of a small network with few samples a ray."""
     small = NeRFModelConfig(
         size="tiny",
         width=8,
@@ -41,7 +41,7 @@ def tiny_config(**changes: Any) -> NeRFModelConfig:
 
 
 def tiny_model(seed: int = 0, grid: OccupancyGrid | None = None, **changes: Any) -> NeRFModel:
-    """A NeRF of that config, in float64."""
+    """A NeRF of `tiny_config`, in float64."""
     return NeRFModel(tiny_config(**changes), np.random.default_rng(seed), grid).double()
 
 

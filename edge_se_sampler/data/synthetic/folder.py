@@ -10,12 +10,10 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v3 as imageio
-import numpy as np
-from numpy.typing import NDArray
 
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.synthetic.cameras import Camera, Framing, Placement, Split, framing, poses
@@ -72,7 +70,7 @@ def make_scenes(
     Raises:
         InputError: before rendering anything, an unknown or repeated name, a number out of range, an offset that leaves
             the object fewer than 8 pixels, an `out` that cannot be written, or an out/<name> that is there and not
-            empty; while rendering, an object that reaches out of a rotated camera's image.
+            empty; while rendering, an object that reaches the edge of a rotated camera's image.
     """
     counts: dict[Split, int] = {"train": num_train, "val": num_val, "test": num_test}
     _check_names(names)
@@ -169,25 +167,10 @@ def _ignore_interrupts() -> None:
 
 def _render_png(view: _View) -> bytes:
     """The PNG file of one view."""
-    scene = synthetic_scene(view.scene)
-    if view.may_clip:
-        picture = _crop_checked(render(scene, _one_pixel_wider(view.camera)), view)
-    else:
-        picture = render(scene, view.camera)
-    png = imageio.imwrite("<bytes>", picture, extension=".png")
-    assert png is not None
-    return png
-
-
-def _one_pixel_wider(camera: Camera) -> Camera:
-    """The same view with one pixel more on each side; the pixels they share are the same."""
-    x, y = camera.principal
-    return replace(camera, principal=(x + 1, y + 1), width=camera.width + 2, height=camera.height + 2)
-
-
-def _crop_checked(wider: NDArray[np.uint8], view: _View) -> NDArray[np.uint8]:
-    """The picture without its outermost pixels; InputError if the object reaches into them."""
-    picture = wider[1:-1, 1:-1]
-    if np.count_nonzero(wider[..., 3]) > np.count_nonzero(picture[..., 3]):
-        raise InputError(f"offset rotates {view.scene} out of the image in view {view.file}: give one nearer to zero")
-    return picture
+    picture = render(synthetic_scene(view.scene), view.camera)
+    border = (picture[0], picture[-1], picture[:, 0], picture[:, -1])
+    if view.may_clip and any(pixels[:, 3].any() for pixels in border):
+        raise InputError(
+            f"offset rotates {view.scene} to the edge of the image in view {view.file}: give one nearer to zero"
+        )
+    return imageio.imwrite("<bytes>", picture, extension=".png")
