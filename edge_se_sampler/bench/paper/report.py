@@ -88,7 +88,7 @@ def describe(folder: Path) -> str:
         "How much of the cure needs no sampler:",
         _other_cures(runs),
         *pictures.values(),
-        "## Comparisons behind the verdicts",
+        "## The comparisons",
         VERDICT_LEGEND,
         *map(_describe_claim, claims),
         "## All tables",

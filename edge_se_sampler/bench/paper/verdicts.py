@@ -19,6 +19,10 @@ MIN_SEEDS = 3
 MIN_DIFFERENCE = 0.3
 """dB: a smaller difference does not matter. An undecided claim needs more runs until they could show this one."""
 
+RANDOM, SE, EDGE, EDGE_SE = "vanilla-nerf", "se-nerf", "edge-nerf", "edge-se-nerf"
+PRECROP, PRECROP_SE = "precrop-nerf", "precrop-se-nerf"
+WITH_SE = {RANDOM: SE, PRECROP: PRECROP_SE, EDGE: EDGE_SE}
+
 Arm = tuple[int, str]  # table, strategy
 Kind = Literal["better", "not inferior", "prevents failures"]
 Verdict = Literal["supported", "not supported", "undecided", "nothing to compare"]
@@ -96,62 +100,54 @@ def _random_with(what: str, table: int, baseline_table: int) -> Comparison:
     return Comparison(label, (table, RANDOM), (baseline_table, RANDOM))
 
 
-def _claim(text: str, source: str, kind: Kind, *comparisons: Comparison) -> Claim:
-    return Claim(text, source, kind, comparisons)
-
-
-RANDOM, SE, EDGE, EDGE_SE = "vanilla-nerf", "se-nerf", "edge-nerf", "edge-se-nerf"
-PRECROP, PRECROP_SE = "precrop-nerf", "precrop-se-nerf"
-WITH_SE = {RANDOM: SE, PRECROP: PRECROP_SE, EDGE: EDGE_SE}
-
 CLAIMS = (
-    _claim(
+    Claim(
         "Where the object is centred, Edge is as stable as Precrop", "sections 4.2.1 and 4.3.1", "not inferior",
-        *_in_tables((1, 3), EDGE, PRECROP), *_in_tables((1, 3), EDGE_SE, PRECROP_SE),
+        (*_in_tables((1, 3), EDGE, PRECROP), *_in_tables((1, 3), EDGE_SE, PRECROP_SE)),
     ),
-    _claim(
+    Claim(
         "Off centre, Edge trains where Precrop fails", "sections 4.2.2 and 4.3.2", "prevents failures",
-        *_in_tables((2, 4), EDGE, PRECROP), *_in_tables((2, 4), EDGE_SE, PRECROP_SE),
+        (*_in_tables((2, 4), EDGE, PRECROP), *_in_tables((2, 4), EDGE_SE, PRECROP_SE)),
     ),
-    _claim(
+    Claim(
         "SE raises PSNR whatever the early phase, at equal steps", "section 4.2.1", "better",
-        *(row for early, late in WITH_SE.items() for row in _in_tables(tuple(PAPER_TABLES), late, early)),
+        tuple(row for early, late in WITH_SE.items() for row in _in_tables(tuple(PAPER_TABLES), late, early)),
     ),
-    _claim(
+    Claim(
         "SE raises PSNR whatever the early phase, at equal time", "ours", "better",
-        *(
+        tuple(
             Comparison(f"{_against(late, early)}, table {n + 8} against {n}", (n + 8, late), (n, early))
             for early, late in WITH_SE.items()
             for n in PAPER_TABLES
         ),
     ),
-    _claim(
+    Claim(
         "With few views, Edge gains more over Precrop", "section 4.3.1", "better",
-        *(_gain_of_few_views(table, EDGE, PRECROP) for table in (3, 5)),
+        tuple(_gain_of_few_views(table, EDGE, PRECROP) for table in (3, 5)),
     ),
-    _claim(
+    Claim(
         "With few views, SE gains more", "abstract", "better",
-        *(_gain_of_few_views(table, EDGE_SE, EDGE) for table in (3, 5)),
+        tuple(_gain_of_few_views(table, EDGE_SE, EDGE) for table in (3, 5)),
     ),
-    _claim(
+    Claim(
         "Sobel edges are better than Laplacian ones", "section 4.1.4", "better",
-        Comparison("Sobel against Laplacian, table 1 against 13", (1, EDGE), (13, EDGE)),
+        (Comparison("Sobel against Laplacian, table 1 against 13", (1, EDGE), (13, EDGE)),),
     ),
-    _claim(
+    Claim(
         "Edge regions get sharper with Edge than with Precrop", "section 5", "better",
-        *_in_tables((1, 3), EDGE, PRECROP, measure="edge_band_psnr"),
+        _in_tables((1, 3), EDGE, PRECROP, measure="edge_band_psnr"),
     ),
-    _claim(
+    Claim(
         "Precrop fails because of where the object is, not because it is small", "ours", "prevents failures",
-        Comparison("Precrop, small and centred against off centre, table 16 against 2", (16, PRECROP), (2, PRECROP)),
+        (Comparison("Precrop, small and centred against off centre, table 16 against 2", (16, PRECROP), (2, PRECROP)),),
     ),
-    _claim(
+    Claim(
         "A softplus density alone keeps Random from failing", "ours", "prevents failures",
-        *(_random_with("softplus against ReLU", *pair) for pair in ((14, 1), (15, 2))),
+        tuple(_random_with("softplus against ReLU", *pair) for pair in ((14, 1), (15, 2))),
     ),
-    _claim(
+    Claim(
         "Reinitialising dead networks keeps Random from failing", "ours", "prevents failures",
-        *(_random_with("dead networks reinitialised", *pair) for pair in ((17, 7), (18, 8))),
+        tuple(_random_with("dead networks reinitialised", *pair) for pair in ((17, 7), (18, 8))),
     ),
 )  # fmt: skip
 
