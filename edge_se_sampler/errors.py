@@ -1,4 +1,4 @@
-"""The one exception that speaks to a person."""
+"""The exception for bad input."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from collections.abc import Iterable, Sequence
 
 
 class InputError(ValueError):
-    """Something a person gave cannot be used.
+    """A flag, file or argument cannot be used.
 
-    The message is one line: what is wrong, where (file and field), what to do. The command line prints it on
-    stderr and leaves with exit code 2; a library caller catches it as a ValueError.
+    The message is one line: what is wrong, where (file and field), and what to do. The command line prints it on
+    stderr and exits with code 2.
     """
 
 
-def check_known(flag: str, chosen: Sequence[object], known: Iterable[object]) -> None:
-    """Refuse names that are not known.
+def check_known(flag: str, names: Sequence[object], known: Iterable[object]) -> None:
+    """Check that the names given to a flag are known ones.
 
     Raises:
-        InputError: one is none of them.
+        InputError: one is not.
     """
     known = tuple(known)
-    for name in chosen:
+    for name in names:
         if name not in known:
             raise InputError(f"--{flag}: {name!r} is none of {', '.join(map(str, known))}")
 

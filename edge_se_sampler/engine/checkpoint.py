@@ -1,8 +1,8 @@
-"""Checkpoints that are whole or not there.
+"""Checkpoints that are written completely or not at all.
 
-A file is one line of text, "edge-se-checkpoint 2 <sha256 of the rest>", and then what torch.save wrote. Written to
-a temporary file, flushed to the disk, renamed: a process killed at any moment leaves the old file or the new one.
-Loaded with weights_only=True, so a pickle in it is refused, never run.
+A file is one line of text, "edge-se-checkpoint 2 <sha256 of the rest>", followed by torch.save's bytes. It is
+written to a temporary file, flushed to the disk and renamed: a process killed at any moment leaves the old file or the
+new one. It is loaded with weights_only=True: a pickle in it is refused, never run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NAME = re.compile(r"step-(\d{9,})\.ckpt")
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
-    """Where the checkpoint after a step (0, 1, ...) lies."""
+    """Path of the checkpoint that was written after a step (0, 1, ...)."""
     return folder / f"step-{step:09d}.ckpt"
 
 
@@ -58,7 +58,7 @@ def latest_checkpoint(folder: Path) -> Path:
 
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
-    """Read a checkpoint and make sure that it is whole and belongs to this configuration.
+    """Read a checkpoint, and check that it is undamaged and of this configuration.
 
     Raises:
         InputError: unreadable, truncated or changed since it was written, not a checkpoint, or saved under another

@@ -1,4 +1,4 @@
-"""What can be set of a training run. Torch-free."""
+"""The settings of a training run. Torch-free."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class MachineConfig:
     """The machine, and the seed."""
 
     seed: int = 0
-    """Of weights, pixels and jitter. The same seed gives every method the same initial weights."""
+    """Seed of weights, pixels and jitter. The same seed gives every method the same initial weights."""
     device_type: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to train; auto takes a GPU if there is one."""
+    """Device to train on; auto is a GPU if there is one."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ class PipelineConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam, its rate decaying exponentially (NeRF, section 5.3)."""
+    """Adam with an exponentially decaying learning rate (NeRF, section 5.3)."""
 
     lr: float | None = None
-    """Initial learning rate; left out, the model's size decides (the paper: 5e-4)."""
+    """Initial learning rate; by default the model size's (the paper: 5e-4)."""
     final_fraction: float = 0.1
     """Learning rate at the end of the planned iterations, as a share of the initial one."""
     eps: float = 1e-8
     """Adam's epsilon."""
     fused: bool = False
-    """Take the step in one pass over the weights: faster, and rounded a little differently."""
+    """Use torch's fused implementation: faster, and rounded a little differently."""
 
     def check(self) -> None:
         """Refuse values without meaning.
@@ -67,25 +67,25 @@ class TrainerConfig(InstantiateConfig):
     data: Path | None = None
     """The Blender folder (transforms_train.json and so on) to train on."""
     num_views: int | None = None
-    """Train on this many of the views, picked as InfoNeRF's code picks them; left out, on all."""
+    """Train on this many of the views, selected as InfoNeRF's code does; by default on all."""
     views: tuple[int, ...] | None = None
-    """Numbers of the views to train on, from 0; instead of --num-views."""
+    """Indices (from 0) of the views to train on, instead of --num-views."""
     output_dir: Path = Path("outputs")
-    """Runs land in OUTPUT_DIR/EXPERIMENT/METHOD/TIMESTAMP."""
+    """Runs are written to OUTPUT_DIR/EXPERIMENT/METHOD/TIMESTAMP."""
     experiment_name: str | None = None
-    """Name of the experiment; left out, the data folder's name."""
+    """Name of the experiment; by default the data folder's name."""
     max_num_iterations: int | None = None
-    """Planned iterations, which phases and learning rate follow; left out, the model's size decides."""
+    """Planned iterations, which determine phases and learning rate; by default the model size's."""
     max_seconds: float | None = None
-    """Stop after this time, wherever the plan is."""
+    """Stop after so many seconds, even if iterations are left."""
     steps_per_save: int = 1000
     """Iterations between checkpoints; one is saved at the end and on Ctrl-C too."""
     steps_per_eval_image: int | None = None
-    """Iterations between previews of a validation view; left out, a tenth of the plan."""
+    """Iterations between previews of a validation view; by default a tenth of the planned ones."""
     steps_per_log: int = 10
     """Iterations between lines of metrics.jsonl."""
     reinit_dead: bool = False
-    """Give a dead network (density 0 everywhere, so no gradient) new initial weights, of the next sub-seed."""
+    """Reinitialize a dead network (density 0 everywhere, hence no gradient) from the seed's next sub-seed."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

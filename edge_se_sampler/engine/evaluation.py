@@ -19,23 +19,23 @@ from edge_se_sampler.models.ray_model import RayModel
 
 
 def evaluate(
-    model: RayModel, pictures: list[Picture], each: Callable[[int, Picture, np.ndarray], None] | None = None
+    model: RayModel, pictures: list[Picture], on_view: Callable[[int, Picture, np.ndarray], None] | None = None
 ) -> dict[str, Any]:
-    """Render every picture and measure all of its pixels, masked ones too. PSNR is the mean over images, as in tables.
+    """Render every picture and compare all of its pixels, masked ones included.
 
     Args:
-        each: called with the number, picture and rendering of every view.
+        on_view: called with index, picture and rendering (H, W, 3) of every view.
 
     Returns:
-        the mean of every measure over the views, psnr_std, psnr_pooled (of the mean mse), num_images, and
-        `images`, the measures of each. lpips is None: its weights are not part of this package.
+        the mean of every metric over the views, psnr_std, psnr_pooled (of the mean mse), num_images, and
+        `images`, the metrics of each. lpips is None: its weights are not part of this package.
     """
     rows = []
     for i, picture in enumerate(pictures):
         rendered, _ = render_view(model, picture)
         rows.append({"name": picture.name, **compute_metrics(rendered, picture.image, model.config.background_level)})
-        if each is not None:
-            each(i, picture, rendered)
+        if on_view is not None:
+            on_view(i, picture, rendered)
     result: dict[str, Any] = {}
     for key in rows[0]:
         values = [row[key] for row in rows if row[key] is not None]
@@ -49,7 +49,7 @@ def evaluate(
 def evaluate_run(
     run: RunFolder, config: TrainerConfig, output_path: Path, render_output_path: Path | None
 ) -> dict[str, Any]:
-    """Measure a run's last checkpoint on its held-out views and write nerfstudio's eval json.
+    """Evaluate a run's last checkpoint on its held-out views, and write a json with the keys of nerfstudio's eval.
 
     Raises:
         InputError: a bad run, or an output that cannot be written.

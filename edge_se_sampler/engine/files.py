@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Outputs: checked before the work, written completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_se_sampler.errors import InputError
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file by new content that is safely on the disk, or leave it as it was.
+    """Replace a file's content and flush it to the disk; on failure leave the file as it was.
 
     Raises:
         InputError: it cannot be written.
@@ -41,10 +41,13 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def check_output(path: Path, flag: str = "--output-path") -> None:
-    """A file that a result will be written to, refused before the work that it takes to have one.
+    """Check that a file can be written.
+
+    Args:
+        flag: of the command line, which named it.
 
     Raises:
-        InputError: it names no file, is a folder, or its folder is not there or not to be written to.
+        InputError: it names no file, is a folder, or its folder does not exist or cannot be written.
     """
     if not path.name or path.is_dir():
         raise InputError(f"{flag} {path}: must name a file, not a folder")
@@ -54,8 +57,8 @@ def check_output(path: Path, flag: str = "--output-path") -> None:
         raise InputError(f"{flag} {path}: {path.parent} cannot be written")
 
 
-def make_room(path: Path, flag: str = "--output-path") -> None:
-    """Make the folder of a file that a result will be written to, and check that it can be.
+def prepare_output(path: Path, flag: str = "--output-path") -> None:
+    """Create the folder of a file, and check that the file can be written.
 
     Raises:
         InputError: as `make_folder` and `check_output`.
@@ -65,13 +68,13 @@ def make_room(path: Path, flag: str = "--output-path") -> None:
 
 
 def make_folder(path: Path, flag: str) -> None:
-    """A folder that results will be written to, made before the work that it takes to have some.
+    """Create a folder that can be written.
 
     Args:
         flag: of the command line, which named it.
 
     Raises:
-        InputError: it cannot be made, or not written to.
+        InputError: it cannot be created or written.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -92,7 +95,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Save a picture, (H, W, 3) float in [0, 1].
+    """Write an (H, W, 3) float image in [0, 1] as PNG.
 
     Raises:
         InputError: it cannot be written.
@@ -101,10 +104,10 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """A picture, (H, W, 3) float in [0, 1], as a PNG file's content."""
-    return iio.imwrite("<bytes>", eight_bit(image), extension=".png")
+    """The content of a PNG file of an (H, W, 3) float image in [0, 1]."""
+    return iio.imwrite("<bytes>", to_uint8(image), extension=".png")
 
 
-def eight_bit(image: np.ndarray) -> np.ndarray:
-    """Floats in [0, 1] (clipped) as uint8."""
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Floats, clipped to [0, 1], as uint8."""
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

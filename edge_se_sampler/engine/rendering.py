@@ -1,4 +1,4 @@
-"""Whole views rendered by a model."""
+"""Views, and a model's renderings of them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from edge_se_sampler.sampling.edges import unit_float
 
 @dataclass(frozen=True)
 class Picture:
-    """A view that a model is compared with."""
+    """An image that a rendering is compared with, and the camera that took it."""
 
     name: str
     image: np.ndarray
     """(H, W, 3|4) float32 in [0, 1], straight alpha."""
     camera: Cameras
-    """The one that took it."""
+    """One camera."""
 
     def rays(self, device: torch.device) -> RayBundle:
-        """Its H * W rays."""
+        """The H * W rays of its pixels, row by row."""
         return self.camera.to(device, torch.float32).image_rays(0)
 
 
 def to_pictures(views: Views) -> list[Picture]:
-    """All views of a split."""
+    """Every view with its camera."""
     return [Picture(name, unit_float(views.images[i]), views.cameras[[i]]) for i, name in enumerate(views.names)]
 
 
 def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
-    """An output of all rays, on the CPU, without gradients and in evaluation mode."""
+    """One of the model's outputs for all rays, on the CPU, without gradients and in evaluation mode."""
     was_training = model.training
     model.eval()
     with torch.no_grad():
@@ -48,11 +48,11 @@ def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
     """A view's rendering (H, W, 3) in [0, 1] and its PSNR.
 
     Raises:
-        FloatingPointError: the model renders values that are not finite.
+        FloatingPointError: a rendered value is not finite.
     """
     height, width = picture.image.shape[:2]
     rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
     if not np.isfinite(rendered).all():
-        raise FloatingPointError("the model's colours are not finite: training diverged; try a lower --optimizer.lr")
+        raise FloatingPointError("the model's colors are not finite: training diverged; try a lower --optimizer.lr")
     error = (rendered.astype(np.float64) - composite_on(picture.image, model.config.background_level)) ** 2
     return rendered, psnr(error.mean())

@@ -28,7 +28,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, config: TrainerConfig) -> RunFolder:
-        """A new folder for a planned config; nothing existing is touched.
+        """A new folder for a resolved config; nothing existing is touched.
 
         Raises:
             InputError: the output folder cannot be written.
@@ -106,13 +106,13 @@ class RunFolder:
             raise InputError(f"{path}: damaged ({problem!r}); mend or remove it") from problem
         return lines
 
-    def forget_after(self, step: int) -> None:
-        """Drop metrics of later steps: a resumed run writes them again."""
+    def drop_metrics_after(self, step: int) -> None:
+        """Drop the metrics of later steps, which a resumed run writes again."""
         kept = [json.dumps(line) + "\n" for line in self.metrics() if line["step"] <= step]
         write_atomically(self.path / "metrics.jsonl", "".join(kept).encode())
 
-    def preview(self, step: int, image: np.ndarray) -> None:
-        """Save an (H, W, 3) float picture in [0, 1] of a step."""
+    def save_preview(self, step: int, image: np.ndarray) -> None:
+        """Save the (H, W, 3) float preview, in [0, 1], of a step."""
         write_image(self.path / "previews" / f"step-{step:09d}.png", image)
 
 
@@ -129,21 +129,21 @@ def _new_folder(parent: Path, stamp: str) -> Path:
 
 
 def config_to_json(config: TrainerConfig) -> dict[str, Any]:
-    """A config as plain values."""
+    """A config as values that json can hold."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=os.fspath))
 
 
 def config_digest(config: TrainerConfig) -> str:
-    """What a checkpoint remembers of its configuration: where the run lies and how long a session lasts aside."""
+    """A hash of every setting that a resumed run must share: not of paths, time limits, checkpoints and the device."""
     values = config_to_json(config)
-    for free in ("output_dir", "data", "max_seconds", "steps_per_save"):
-        del values[free]
+    for name in ("output_dir", "data", "max_seconds", "steps_per_save"):
+        del values[name]
     del values["machine"]["device_type"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def config_from_json(default: Any, values: Any, where: str) -> Any:
-    """Plain values back into the (nested) config dataclass that they came from.
+    """The (nested) config dataclass that `config_to_json` turned into these values.
 
     Raises:
         InputError: fields that are missing, unknown or of another type: another version wrote it.

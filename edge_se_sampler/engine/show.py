@@ -1,4 +1,4 @@
-"""A picture of what a sampler does to one's own images: view, probability, and where a batch really fell."""
+"""A figure of what a sampler does to images: view, probability of every pixel, and the pixels of a batch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, Distribution
 
 
 def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np.ndarray:
-    """p of every pixel of the view at position k, (H, W); sums to 1 (or is 0 where all is masked)."""
+    """Probability of every pixel of the kth view, (H, W); it sums to 1, or to 0 if all pixels are masked."""
     table = PixelTable()
     strength = torch.from_numpy(distribution.strength(batch.image(k), batch.background_color))
     table.add([strength if batch.mask is None else strength * batch.valid(k)])
@@ -29,13 +29,13 @@ def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np
 
 
 def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Path, num_views: int, seed: int) -> None:
-    """Draw the figure.
+    """Draw the figure, and write it as PNG.
 
     Args:
         views: training views.
-        config: of the sampler; num_rays_per_batch pixels are drawn from each view.
+        config: the sampler's; num_rays_per_batch pixels are drawn from each view.
         strategy: "uniform", "precrop" or "edge".
-        num_views: how many views, evenly spread.
+        num_views: number of views shown, evenly spaced.
 
     Raises:
         InputError: matplotlib is missing, or the settings do not fit the images.

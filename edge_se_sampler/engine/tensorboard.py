@@ -8,7 +8,7 @@ from typing import Any
 
 
 class EventWriter:
-    """Writes the numbers of metrics lines as scalars; does nothing without the extra."""
+    """Writes the numbers of metrics.jsonl's lines as scalars; without the extra it does nothing."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

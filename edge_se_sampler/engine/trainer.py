@@ -30,10 +30,10 @@ class Trainer:
     """Trains a model into a run folder.
 
     Args:
-        config: planned (see `plan`).
-        run: where it is written.
-        pipeline: what is trained.
-        preview: a view to look at while training, or None.
+        config: resolved (see `resolve_config`).
+        run: the folder for checkpoints, metrics and previews.
+        pipeline: data manager and model.
+        preview: a held-out view, rendered every now and then; None: no previews.
     """
 
     def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
@@ -57,7 +57,7 @@ class Trainer:
         self._preview_psnr: float | None = None
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Take up the run at a checkpoint's state.
+        """Continue from a checkpoint's state.
 
         Raises:
             InputError: it is another model's.
@@ -69,14 +69,14 @@ class Trainer:
             self.dead_network_reset.load_state_dict(state["dead_network_reset"])
         self.pipeline.datamanager.load_state_dict(state["sampler"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
-        self.run.forget_after(state["step"])
+        self.run.drop_metrics_after(state["step"])
 
     def train(self) -> None:
-        """Train to the end of the plan, to max_seconds, or until Ctrl-C; then save.
+        """Train until the planned iterations are done, max_seconds have passed, or Ctrl-C; then save.
 
         Raises:
-            FloatingPointError: the loss is not finite; the last checkpoint stands.
-            InputError: something cannot be written.
+            FloatingPointError: the loss or a weight is not finite; the last checkpoint is kept.
+            InputError: a file cannot be written.
         """
         config = self.config
         began = time.monotonic() - self.elapsed
@@ -93,16 +93,20 @@ class Trainer:
                     self._log(step, loss, learning_rate)
                 if ended or self.next_step % config.preview_interval == 0:
                     self._preview(step)
-                    began = time.monotonic() - self.elapsed  # looking is not training
+                    began = time.monotonic() - self.elapsed  # a preview is not training time
                 if stop or self.next_step % config.steps_per_save == 0:
                     self.save()
-                progress.update(self.next_step, note=self._note(loss))
+                progress.update(self.next_step, note=self._status(loss))
                 if stop:
                     break
         self.events.close()
 
     def train_iteration(self, step: int) -> float:
-        """One step; returns its loss."""
+        """Train one step, and return its loss.
+
+        Raises:
+            FloatingPointError: the loss is not finite; the weights are as before.
+        """
         model = self.pipeline.model
         model.train()
         for callback in self.callbacks:
@@ -111,15 +115,15 @@ class Trainer:
         model.begin_step(step, int(stream(seed, step, Stream.MODEL).integers(2**63)))
         rays, batch = self.pipeline.datamanager.next_train(step)
         self.optimizer.zero_grad()
-        batch.pop("full_image", None)  # not of these rays alone
+        batch.pop("full_image", None)  # whole images: not indexed by ray
         errors = []
 
-        def seen_loss(rows: slice) -> torch.Tensor:
-            part, error = model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
+        def training_loss(rows: slice) -> torch.Tensor:
+            loss, error = model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
             errors.append(error)
-            return part
+            return loss
 
-        loss = self._backward(len(rays), seen_loss)
+        loss = self._backward(len(rays), training_loss)
         if model.num_unseen_rays:
             unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, stream(seed, step, Stream.UNSEEN))
             loss += self._backward(len(unseen), lambda rows: model.auxiliary_loss(unseen[rows]))
@@ -132,7 +136,7 @@ class Trainer:
                 tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
                 self._record(step, reinitialized=network, sub_seed=sub_seed)
         for weight, state in self.optimizer.state.items():
-            if state["exp_avg"].shape != weight.shape:  # a table of features that has got more rows, or fewer
+            if state["exp_avg"].shape != weight.shape:  # a feature table that was resized
                 state.clear()
         self.optimizer.step()
         self.scheduler.step()
@@ -141,20 +145,20 @@ class Trainer:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return value
 
-    def _backward(self, rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
-        """Add the gradients of a loss's mean over rays, as many rays at a time as are worth rendering; that mean."""
+    def _backward(self, num_rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
+        """Accumulate the gradients of the mean loss over rays, chunk by chunk, and return that mean."""
         loss = torch.zeros((), device=self.pipeline.model.device)
-        for rows in self.pipeline.model.chunks(rays):
-            part = loss_of(rows).sum() / rays
-            part.backward()
-            loss += part.detach()
+        for rows in self.pipeline.model.chunks(num_rays):
+            chunk_loss = loss_of(rows).sum() / num_rays
+            chunk_loss.backward()
+            loss += chunk_loss.detach()
         return loss
 
     def save(self) -> None:
         """Write a checkpoint of the steps done so far.
 
         Raises:
-            FloatingPointError: a weight is not finite; such a state is not worth keeping.
+            FloatingPointError: a weight is not finite; nothing is written.
             InputError: it cannot be written.
         """
         if not all(torch.isfinite(weight).all() for weight in self.pipeline.model.parameters()):
@@ -188,16 +192,16 @@ class Trainer:
         rendered, psnr = render_view(self.pipeline.model, self.preview_picture)
         self._preview_psnr = psnr
         self._record(step, val_psnr=psnr)
-        self.run.preview(step, rendered)
+        self.run.save_preview(step, rendered)
 
-    def _note(self, loss: float) -> str:
+    def _status(self, loss: float) -> str:
         rate = self.next_step * self.config.preset.rays / self.elapsed
         psnr = "" if self._preview_psnr is None else f", PSNR {self._preview_psnr:.2f}"
         return f"{rate:,.0f} rays/s, loss {loss:.5f}{psnr}"
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Ctrl-C or a termination lets the step end, so that what is saved is whole."""
+        """Let Ctrl-C or a SIGTERM end the current step first, so that a consistent state is saved."""
 
         def request_stop(*_: Any) -> None:
             self.stop_requested = True
@@ -205,7 +209,7 @@ class Trainer:
         signals = (signal.SIGINT, signal.SIGTERM)
         try:
             previous = [(number, signal.signal(number, request_stop)) for number in signals]
-        except ValueError:  # not the main thread: signals are somebody else's
+        except ValueError:  # only the main thread may handle signals
             previous = []
         try:
             yield
@@ -222,6 +226,6 @@ def create_adam(
     if config.fused:
         try:
             return torch.optim.Adam(parts, eps=config.eps, fused=True)
-        except RuntimeError:  # before torch 2.4 a GPU's weights only
+        except RuntimeError:  # before torch 2.4, for weights on a GPU only
             pass
     return torch.optim.Adam(parts, eps=config.eps)

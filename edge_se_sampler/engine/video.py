@@ -10,7 +10,7 @@ import torch
 
 from edge_se_sampler.engine.camera_path import spiral
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, eight_bit, write_atomically
+from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_rays
 from edge_se_sampler.engine.run_folder import RunFolder
@@ -47,7 +47,7 @@ def render_run(
 
 
 def check_video(path: Path, frames_per_second: int) -> None:
-    """Refuse early what `write_video` could not write.
+    """Check that `write_video` can write such a file.
 
     Raises:
         InputError: neither .gif nor .mp4, too fast for a GIF, the [video] extra is missing, or the file cannot be
@@ -71,7 +71,7 @@ def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) ->
     Raises:
         InputError: it cannot be written.
     """
-    stacked = eight_bit(np.stack(frames))
+    stacked = to_uint8(np.stack(frames))
     if path.suffix.lower() == ".gif":
         content = iio.imwrite(
             "<bytes>", stacked, extension=".gif", duration=10 * round(100 / frames_per_second), loop=0
