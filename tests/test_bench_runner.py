@@ -91,6 +91,13 @@ def test_a_later_call_trains_only_what_is_pending(tmp_path: Path) -> None:
     assert trained == TRIALS
 
 
+def test_every_command_that_trained_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for count in (1, 1, 2):
+        monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy", str(count)])
+        run_experiment(toy_experiment(trials=lambda _, count=count: TRIALS[:count]), tmp_path, one_thread)
+    assert read(tmp_path)["command"] == "edge-se bench toy 1\nedge-se bench toy 2"
+
+
 def test_later_trials_may_depend_on_earlier_runs(tmp_path: Path) -> None:
     def trials(runs: list[Run]) -> list[ToyTrial]:
         best = max((run["seed"] for run in runs if run["scene"] == "mic"), default=None)
@@ -120,25 +127,31 @@ def test_a_failing_trial_is_reported_stops_no_other_and_is_tried_again(
     assert again["errors"] == []
 
 
+EMPTY = {
+    "version": 2, "experiment": "toy", "command": "", "settings": {"steps": 3}, "machine": {}, "runs": [], "errors": [],
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "content",
+    "change",
     [
-        "",
-        "{}",
-        "[]",
-        '{"version": 1, "experiment": "toy", "settings": {"steps": 3}, "machine": {}, "runs": [], "errors": []}',
-        '{"version": 2, "experiment": "toy", "settings": {"steps": 3}, "machine": {}, "runs": 3, "errors": []}',
-        '{"version": 2, "experiment": "toy", "settings": {"steps": 3}, "machine": {}, "runs": [7], "errors": []}',
-        '{"version": 2, "experiment": "other", "settings": {"steps": 3}, "machine": {}, "runs": [], "errors": []}',
-        '{"version": 2, "experiment": "toy", "settings": {"steps": 4}, "machine": {}, "runs": [], "errors": []}',
+        {"version": 1},
+        {"runs": 3},
+        {"runs": [7]},
+        {"machine": None},
+        {"experiment": "other"},
+        {"settings": {"steps": 4}},
     ],
+    ids=str,
 )
-def test_a_file_that_is_no_result_of_the_experiment_is_refused_and_kept(content: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_result_of_the_experiment_is_refused_and_kept(change: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "result.json"
-    path.write_text(content)
-    with pytest.raises(InputError, match=r"result\.json"):
-        run_experiment(toy_experiment(), tmp_path, one_thread)
-    assert path.read_text() == content
+    content = {key: value for key, value in {**EMPTY, **change}.items() if value is not None}
+    for text in (json.dumps(content), json.dumps(content)[:-1], "[]"):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"result\.json"):
+            run_experiment(toy_experiment(), tmp_path, one_thread)
+        assert path.read_text() == text
 
 
 def test_listing_trials_trains_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -91,14 +91,18 @@ def load_or_create(path: Path, experiment: Experiment) -> dict[str, Any]:
     result = read_result(path)
     if result["experiment"] != experiment.name or result["settings"] != settings:
         raise InputError(f"{path}: of another experiment or other settings; name another --output-dir, or move it away")
+    result["command"] = "\n".join(dict.fromkeys([*result["command"].splitlines(), _command()]))
     return result
 
 
 def new_result(experiment: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """What every json of results begins with."""
-    command = shlex.join(["edge-se", *sys.argv[1:]])
-    head = {"version": VERSION, "experiment": experiment, "command": command}
+    """What every json of results begins with; command: those that have trained it, one a line."""
+    head = {"version": VERSION, "experiment": experiment, "command": _command()}
     return {**head, "settings": settings, "machine": machine()}
+
+
+def _command() -> str:
+    return shlex.join(["edge-se", *sys.argv[1:]])
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -111,8 +115,8 @@ def read_result(path: Path) -> dict[str, Any]:
         result = json.loads(path.read_text(encoding="utf-8"))
         if result["version"] != VERSION:
             raise ValueError(f"version {result['version']}, not {VERSION}")
-        if not {"experiment", "settings", "machine"} <= result.keys():
-            raise KeyError("experiment, settings or machine")
+        if not {"experiment", "command", "settings", "machine"} <= result.keys():
+            raise KeyError("experiment, command, settings or machine")
         if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
             raise TypeError("runs and errors are lists of objects")
     except (OSError, ValueError, KeyError, TypeError) as problem:

@@ -1,8 +1,7 @@
-"""Pictures of the chart: PSNR over training time, network queries and memory."""
+"""Pictures of the chart: PSNR over training time."""
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Collection, Sequence
 from typing import Any
 
@@ -23,7 +22,6 @@ from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.engine.figures import require_pyplot
 
-MIB = 2**20
 RECOMMENDED_STYLE = ("black", "-")
 Style = tuple[str, str]
 """Color and line style."""
@@ -74,28 +72,6 @@ def draw_parts(runs: list[Run], groups: Sequence[Group], settings: ChartSettings
         _finish(axis, time_label(settings))
         axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14))
     axes[0, 0].set_ylabel("test PSNR [dB]")
-    figure.tight_layout()
-    return figure
-
-
-def draw_costs(runs: list[Run]) -> Any:
-    """Methods and their error sources: PSNR over network queries, and at the end over memory (medians)."""
-    figure, (queries, memory) = require_pyplot().subplots(1, 2, figsize=(10.4, 4.2), sharey=True)
-    shown = comparable_groups(runs, TOP)
-    for name, (color, line) in _styles(shown).items():
-        strong = name == RECOMMENDED
-        for run in shown[name]:
-            rows = np.array(run["curve"])
-            queries.plot(rows[:, 2], rows[:, 3], line, color=color, lw=2 if strong else 0.9)
-        psnr = statistics.median(run["psnr"] for run in shown[name])
-        peak = statistics.median(run["peak_bytes"] for run in shown[name]) / MIB
-        memory.plot(peak, psnr, "*" if strong else "o", color=color, ms=12 if strong else 7, label=VARIANTS[name].label)
-    queries.set(xscale="log", xlabel="network queries (points)", ylabel="test PSNR [dB]")
-    memory.set(xlim=(0, 1.1 * memory.get_xlim()[1]), xlabel="peak memory above the imports' [MiB]")
-    memory.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    for axis in (queries, memory):
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
     return figure
 

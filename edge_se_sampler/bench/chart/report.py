@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.baselines.results import name_of, read_baselines
-from edge_se_sampler.bench.chart.figures import MIB, draw_chart, draw_costs, draw_parts, draw_scenes
-from edge_se_sampler.bench.chart.reproduce import commands_of
+from edge_se_sampler.bench.chart.figures import draw_chart, draw_parts, draw_scenes
 from edge_se_sampler.bench.chart.summary import (
     END,
     always_better,
@@ -33,7 +32,6 @@ CAPTIONS = {
     "chart": "Test PSNR against training time: methods, error sources (dashed) and other programs (dotted)",
     "scenes": "Test PSNR against training time on every scene, a line a seed; a cross: training failed",
     "parts": "lean-nerf with one thing changed at a time",
-    "costs": "Test PSNR against network queries and against memory",
 }
 NOTES = "notes.md"
 """Remarks by hand, which no number of the result shows; appended to the README where there are any."""
@@ -48,7 +46,6 @@ def draw(folder: Path, workplace: Path | None) -> None:
         return
     if len(comparable_groups(runs, TOP)) > 1:
         save_figure(draw_chart(runs, baselines, settings), folder / "chart.png")
-        save_figure(draw_costs(runs), folder / "costs.png")
     groups: list[Group] = [g for g in _groups(runs) if g not in TOP and len(comparable_groups(runs, [g])) > 1]
     if groups:
         save_figure(draw_parts(runs, groups, settings), folder / "parts.png")
@@ -61,22 +58,17 @@ def describe(folder: Path) -> str:
     runs = result["runs"]
     parts = ["# Speed against accuracy: test PSNR against training time", _describe_settings(runs, settings)]
     if runs:
-        parts += [*_picture(folder, "chart"), *_describe_methods(runs, baselines), *_picture(folder, "costs")]
+        parts += _picture(folder, "chart")
         for group in _groups(runs):
             title, text = GROUPS[group]
-            parts += [f"## {title}", text, _group_table(runs, group), *_ahead_and_behind(runs, group)]
-        parts += _picture(folder, "parts")
-        parts += [*_describe_comparisons(runs), *_describe_envelope(runs)]
-        parts += [
-            *_describe_scenes(runs, baselines),
-            *_picture(folder, "scenes"),
-            *_describe_baselines(runs, baselines),
-        ]
+            parts += [f"## {title}", text, _group_table(runs, group, baselines), *_describe_group(runs, group)]
+        parts += [*_picture(folder, "parts"), *_describe_comparisons(runs), *_describe_envelope(runs)]
+        parts += [*_describe_scenes(runs, baselines), *_picture(folder, "scenes")]
     if (folder / NOTES).exists():
         parts += ["## Remarks", (folder / NOTES).read_text(encoding="utf-8").strip()]
+    commands = "\n".join(found["command"] for found in (*baselines, result))
     parts += [
-        "## Reproduce it",
-        f"```bash\n{chr(10).join(commands_of(folder, runs, settings, baselines))}\n```",
+        f"## Reproduce it\n\n```bash\n{commands}\n```",
         "`edge-se bench report` writes this page and its pictures again from the numbers alone.",
         f"Measured on: {describe_machine(result['machine'])}.",
     ]
@@ -86,16 +78,7 @@ def describe(folder: Path) -> str:
 def tables(folder: Path) -> dict[str, str]:
     """methods: PSNR of methods and baselines after some seconds and at the end, and failures."""
     result, _, baselines = _read(folder)
-    runs = result["runs"]
-    shown = comparable_groups(runs, TOP)
-    seconds = _shown_seconds(runs)
-    rows = [
-        [VARIANTS[name].label, *_psnr_fields(shown[name], seconds), _failures(shown[name])]
-        for name in shown
-        if VARIANTS[name].group == "methods"
-    ]
-    rows += [[name, *fields, "–"] for name, fields in _baseline_rows(runs, baselines)]
-    return {"methods": markdown_table(["", *_seconds_head(seconds), "failed"], rows)}
+    return {"methods": _group_table(result["runs"], "methods", baselines, costs=False)}
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], ChartSettings, list[dict[str, Any]]]:
@@ -128,67 +111,47 @@ def _describe_settings(runs: list[Run], settings: ChartSettings) -> str:
     )
 
 
-def _describe_methods(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[str]:
-    """Who is best of the methods, and who failed."""
-    shown = comparable_groups(runs, ["methods"])
-    if len(shown) < 2 or RECOMMENDED not in shown:
-        return []
-    ends = {VARIANTS[name].label: mean_psnr_at(shown[name], END) or 0.0 for name in shown if name != RECOMMENDED}
-    best = max(ends, key=ends.__getitem__)
-    scenes = ", ".join(scenes_of(shown[RECOMMENDED]))
-    label = VARIANTS[RECOMMENDED].label
-    end = mean_psnr_at(shown[RECOMMENDED], END) or 0.0
-    text = f"On {scenes} {label} ends at {end:.2f} dB, the best of the other methods ({best}) at {ends[best]:.2f} dB"
-    others = [(fields[-1], name) for name, fields in _baseline_rows(runs, baselines) if fields[-1] != "–"]
-    if others:
-        psnr, name = max(others, key=lambda row: float(row[0]))
-        text += f", the best of the other programs ({name}) at {psnr} dB"
-    found = {name: runs_of(runs, name) for name in shown}
-    failures = [
-        f"{VARIANTS[name].label} in {_failures(found[name])}" for name in found if any(map(failed, found[name]))
-    ]
-    verdict = f"Trainings failed with {', '.join(failures)}; with no other method." if failures else "None failed."
-    return [f"{text} (scenes and seeds that all have). {verdict}"]
-
-
-def _group_table(runs: list[Run], group: Group) -> str:
-    """A group's variants: PSNR, failures and costs."""
-    shown = comparable_groups(runs, TOP if group in TOP else [group])
-    seconds = _shown_seconds(runs)
+def _group_table(runs: list[Run], group: Group, baselines: Sequence[dict[str, Any]], costs: bool = True) -> str:
+    """A group's variants, and baselines beside methods: PSNR, failures and costs."""
+    of_variant = comparable_groups(runs, TOP if group in TOP else [group])
+    seconds = _column_seconds(runs)
     rows = [
-        [VARIANTS[name].label, *_psnr_fields(shown[name], seconds), _failures(shown[name]), *_cost_fields(shown[name])]
-        for name in shown
+        [VARIANTS[name].label, *_psnr_fields(found, seconds), _failures(found), *_cost_fields(found)]
+        for name, found in of_variant.items()
         if VARIANTS[name].group == group or name == RECOMMENDED
     ]
-    return markdown_table(["", *_seconds_head(seconds), "failed", "ms a step", "queries a step", "memory"], rows)
+    if group == "methods":
+        all_runs = [run for found in of_variant.values() for run in found]
+        for baseline in baselines:
+            psnr = _psnr_fields(baseline_runs(baseline, all_runs), seconds)
+            rows.append([f"{name_of(baseline)} ({baseline['settings']['program_version']})", *psnr, *"––––"])
+    head = ["", *_seconds_head(seconds), "failed", "ms a step", "queries a step", "memory"]
+    return markdown_table(head, rows) if costs else markdown_table(head[:-3], [row[:-3] for row in rows])
 
 
-def _ahead_and_behind(runs: list[Run], group: Group) -> list[str]:
+def _describe_group(runs: list[Run], group: Group) -> list[str]:
     """Which variants of a group are ahead of the recommended one at first, and which in the end."""
-    seconds = _shown_seconds(runs)
-    shown = comparable_groups(runs, [group])
-    if group in TOP or RECOMMENDED not in shown or not seconds:
+    first = _column_seconds(runs)[:1]
+    of_variant = comparable_groups(runs, [group])
+    reference = of_variant.pop(RECOMMENDED, None)
+    if group in TOP or not (first and reference and of_variant):
         return []
-    signs: dict[tuple[bool, bool], list[str]] = {}
-    for name in (name for name in shown if name != RECOMMENDED):
-        first, end = (
-            (mean_psnr_at(shown[name], t) or 0.0) > (mean_psnr_at(shown[RECOMMENDED], t) or 0.0)
-            for t in (seconds[0], END)
-        )
-        signs.setdefault((first, end), []).append(VARIANTS[name].label)
-    words = {
-        (True, True): "ahead both times",
-        (True, False): "ahead at first, behind in the end",
-        (False, True): "behind at first, ahead in the end",
-        (False, False): "behind both times",
+    labels: dict[tuple[bool, ...], list[str]] = {}
+    for name, found in of_variant.items():
+        ahead = ((mean_psnr_at(found, t) or 0.0) > (mean_psnr_at(reference, t) or 0.0) for t in (*first, END))
+        labels.setdefault(tuple(ahead), []).append(VARIANTS[name].label)
+    words: dict[tuple[bool, ...], str] = {
+        (True, True): "ahead",
+        (True, False): "ahead, then behind",
+        (False, True): "behind, then ahead",
     }
-    listed = "; ".join(f"{words[key]}: {', '.join(signs[key])}" for key in words if key in signs)
-    return [f"Against {VARIANTS[RECOMMENDED].label}, after {seconds[0]} s and at the end: {listed}."]
+    listed = "; ".join(f"{words.get(key, 'behind')}: {', '.join(names)}" for key, names in sorted(labels.items()))
+    return [f"Against {VARIANTS[RECOMMENDED].label}, after {first[0]} s and at the end: {listed}."]
 
 
 def _describe_comparisons(runs: list[Run]) -> list[str]:
     """The pairs of variants that tell what one thing is worth, over all scenes that both were trained on."""
-    seconds = [*_shown_seconds(runs), END]
+    seconds = [*_column_seconds(runs), END]
     rows = []
     for (first, second), what in COMPARISONS.items():
         ahead = [differences(runs, first, second, t) for t in seconds]
@@ -242,14 +205,14 @@ def _describe_scenes(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> li
     common = set.intersection(*({(r["scene"], r["seed"]) for r in found} for found in complete.values()))
     rows = []
     for name, found in complete.items():
-        shown = [run for run in found if run["scene"] in scenes and (run["scene"], run["seed"]) in common]
+        compared = [run for run in found if run["scene"] in scenes and (run["scene"], run["seed"]) in common]
         cells, psnr = [], []
-        for of_scene in ([run for run in shown if run["scene"] == scene] for scene in scenes):
+        for of_scene in ([run for run in compared if run["scene"] == scene] for scene in scenes):
             psnr.append(statistics.median(run["curve"][-1][-1] for run in of_scene))
             any_failed = any("outcome" in run and failed(run) for run in of_scene)
             cells.append(f"({psnr[-1]:.2f})" if any_failed else f"{psnr[-1]:.2f}")
-        least = min(run["curve"][-1][-1] for run in shown)
-        rows.append([name, *cells, f"{statistics.mean(psnr):.2f}", f"{least:.2f}", _failures(shown)])
+        least = min(run["curve"][-1][-1] for run in compared)
+        rows.append([name, *cells, f"{statistics.mean(psnr):.2f}", f"{least:.2f}", _failures(compared)])
     return [
         "## Every scene",
         "PSNR at the end, on the scenes and seeds that all of these have; in brackets where a training failed. "
@@ -258,29 +221,7 @@ def _describe_scenes(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> li
     ]
 
 
-def _describe_baselines(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[str]:
-    if not baselines:
-        return []
-    seconds = _shown_seconds(runs)
-    versions = [baseline["settings"]["program_version"] for baseline in baselines]
-    rows = [[name, v, *fields] for v, (name, fields) in zip(versions, _baseline_rows(runs, baselines), strict=True)]
-    return [
-        "## Other programs (baselines)",
-        "They run unchanged, by the same clock, on the same data and test views, with smaller settings than their "
-        "own (flags below), because no CPU gets anywhere with those; others may find better flags. Whether they failed "
-        "is not known.",
-        markdown_table(["", "version", *_seconds_head(seconds)], rows),
-    ]
-
-
-def _baseline_rows(runs: list[Run], baselines: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
-    """Name, and PSNR on the scenes that the methods are compared on."""
-    shown = [run for found in comparable_groups(runs, TOP).values() for run in found]
-    seconds = _shown_seconds(runs)
-    return [(name_of(baseline), _psnr_fields(baseline_runs(baseline, shown), seconds)) for baseline in baselines]
-
-
-def _shown_seconds(runs: list[Run]) -> list[int]:
+def _column_seconds(runs: list[Run]) -> list[int]:
     """Moments that tables have columns for."""
     return [seconds for seconds in (3, 7, 20, 60) if any(run["seconds"] > 1.05 * seconds for run in runs)]
 
@@ -300,5 +241,5 @@ def _failures(runs: list[Run]) -> str:
 def _cost_fields(runs: list[Run]) -> list[str]:
     step = statistics.median(1000 * (run["seconds"] - run["ready_seconds"]) / run["steps"] for run in runs)
     queries = statistics.median(run["queries"] / run["steps"] for run in runs)
-    memory = statistics.median(run["peak_bytes"] for run in runs) / MIB
+    memory = statistics.median(run["peak_bytes"] for run in runs) / 2**20
     return [f"{step:.1f}", f"{queries:,.0f}", f"{memory:,.0f} MiB"]

@@ -102,7 +102,9 @@ GROUPS: dict[Group, tuple[str, str]] = {
         "whole length; and `lean-nerf`, whose one small network is evaluated only in the *hull*: the cells of space "
         "that no two views see to be background, by their alpha masks. The six use the masks for compositing alone; "
         'what `lean-nerf` is without masks stands below as "no hull". On the original NeRF the choice of pixels '
-        "decides whether anything is learnt at all.",
+        "decides whether anything is learnt at all. Other programs run unchanged, by the same clock, on the same data "
+        "and test views, with smaller settings than their own (in the commands below), because no CPU gets anywhere "
+        "with those; others may find better ones. Whether they failed is not known.",
     ),
     "errors": (
         "Cheaper squared errors, and no fixed phase length",
