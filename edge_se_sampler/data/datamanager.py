@@ -122,7 +122,11 @@ def unit_interval(image: Tensor) -> Tensor:
 
 
 def image_batch(views: Views) -> dict[str, Any]:
-    """All views as nerfstudio's loaders hand them on: stacked, or lists where sizes differ.
+    """All views in nerfstudio's format.
+
+    Returns:
+        "image" (n, H, W, 3|4) uint8, "mask" (n, H, W, 1) bool if there are any, "image_idx" (n,) int64; lists of n
+        images and masks where sizes differ. Among RGBA images RGB ones get opaque alpha.
 
     Raises:
         InputError: no views.
