@@ -1,7 +1,7 @@
-"""The named methods: the paper's six strategies on NeRF, two on InfoNeRF, lean-nerf, and whatever others register.
+"""The named methods: the paper's six strategies on NeRF, two on InfoNeRF, lean-nerf, and those of other packages.
 Torch-free.
 
-A package adds a method with an entry point of the group edge_se_sampler.method_configs that names a
+A package adds a method by an entry point of the group edge_se_sampler.method_configs that names an
 `engine.config.MethodSpecification`.
 """
 
@@ -26,52 +26,47 @@ STRATEGIES = {
     "edge-nerf": ("edge", "uniform", "Edge: by edge strength first, then uniformly"),
     "edge-se-nerf": ("edge", "se", "Edge + SE: by edge strength first, then by squared error"),
 }
-"""Name -> early, late, description: table 1 of the paper."""
-
+"""Method -> early, late, description: table 1 of the paper."""
 
 INFO_NERF = {
-    "info-nerf": ("vanilla-nerf", "InfoNeRF: NeRF from few views (--num-views), unseen rays kept unambiguous"),
+    "info-nerf": ("vanilla-nerf", "InfoNeRF: NeRF from few views (--num-views), with losses on unseen rays"),
     "edge-se-info-nerf": ("edge-se-nerf", "Edge + SE on InfoNeRF"),
 }
-"""Name -> strategy, description: the paper's other method. The other strategies by flag."""
+"""Method -> one of `STRATEGIES`, description: the paper's other model. It takes the other strategies by flags."""
 
 
-LEAN = "lean-nerf"
-
-
-def _specification(name: str) -> MethodSpecification:
+def _paper_method(name: str) -> MethodSpecification:
     model: NeRFModelConfig = InfoNeRFModelConfig() if name in INFO_NERF else NeRFModelConfig()
-    strategy, description = INFO_NERF.get(name, (name, ""))
-    early, late, of_strategy = STRATEGIES[strategy]
+    strategy, info_description = INFO_NERF.get(name, (name, ""))
+    early, late, description = STRATEGIES[strategy]
     sampler = EdgeSEPixelSamplerConfig(early=early, late=late)  # pyright: ignore[reportArgumentType]
     pipeline = PipelineConfig(datamanager=VanillaDataManagerConfig(pixel_sampler=sampler), model=model)
-    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description or of_strategy)
+    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), info_description or description)
 
 
-def _lean() -> MethodSpecification:
-    """What we recommend."""
+def _lean_nerf() -> MethodSpecification:
     sampler = EdgeSEPixelSamplerConfig(early="auto", late="uniform", images_per_step="all")
     manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
     pipeline, adam = PipelineConfig(manager, LeanModelConfig()), OptimizerConfig(eps=1e-15, fused=True)
-    config = TrainerConfig(method_name=LEAN, pipeline=pipeline, optimizer=adam)
-    return MethodSpecification(config, "One small network, asked only where the scene is: what we recommend")
+    config = TrainerConfig(method_name="lean-nerf", pipeline=pipeline, optimizer=adam)
+    return MethodSpecification(config, "A small network, evaluated only where the scene is: recommended")
 
 
 @dataclass(frozen=True)
 class RegisteredMethod:
-    """A method and the distribution it comes from."""
+    """A method, and the installed package that it comes from."""
 
     specification: MethodSpecification
     origin: str
 
 
 def registered_methods() -> dict[str, RegisteredMethod]:
-    """Every method by name: ours, then those of other installed packages.
+    """Every method by name: this package's, then those of other installed packages.
 
     An entry point that fails to load, is no MethodSpecification or takes a name that exists is left out with
-    one line on stderr; it must not keep the others from working.
+    one line on stderr; it must not break the others.
     """
-    ours = {name: _specification(name) for name in (*STRATEGIES, *INFO_NERF)} | {LEAN: _lean()}
+    ours = {name: _paper_method(name) for name in (*STRATEGIES, *INFO_NERF)} | {"lean-nerf": _lean_nerf()}
     methods = {name: RegisteredMethod(specification, "edge_se_sampler") for name, specification in ours.items()}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
         origin = entry.dist.name if entry.dist else entry.value

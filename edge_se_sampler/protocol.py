@@ -1,8 +1,8 @@
-"""The minimal nerfstudio-compatible protocol: the same names, arguments and meanings, only as much as is used.
+"""The part of nerfstudio's interface that is used here: the same names, arguments and meanings.
 
-A class written against nerfstudio 1.1.5's PixelSampler or VanillaDataManager contract finds here what it asks of
-its host: `config.setup(**kwargs)`, `sample(image_batch)` returning `indices` with absolute image numbers, data
-managers with `next_train(step)` and training callbacks bound to a pipeline. Torch-free at import.
+A class written for nerfstudio 1.1.5's PixelSampler or VanillaDataManager finds here what it needs of its host:
+`config.setup(**kwargs)`, `sample(image_batch)` returning `indices` with absolute image numbers, and training callbacks.
+Torch-free at import.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol
 
 
 class InstantiateConfig:
-    """A config that can build what it configures."""
+    """A config that builds the object that it configures."""
 
     _target: ClassVar[type | str]
     """The class to build, or "module:Class", imported on `setup` only: reading configs stays cheap."""
@@ -32,10 +32,10 @@ class InstantiateConfig:
 
 @dataclass
 class PixelSamplerConfig(InstantiateConfig):
-    """What any pixel sampler has to know. Not frozen: nerfstudio's is not, and theirs may stand in for ours."""
+    """Settings of every pixel sampler. Not frozen, as nerfstudio's is not, which may be used instead."""
 
     num_rays_per_batch: int = 1024
-    """Pixels drawn a step; the data manager's number of rays overrides it."""
+    """Pixels drawn per step; the data manager's number of rays overrides it."""
     keep_full_image: bool = False
     """Return the whole images as well, under "full_image"."""
     ignore_mask: bool = False
@@ -46,7 +46,7 @@ class PixelSampler(ABC):
     """Chooses the pixels of a training step.
 
     Args:
-        config: its settings; kwargs named num_rays_per_batch, keep_full_image override them, others are kept.
+        config: its settings, written into; num_rays_per_batch and keep_full_image among the kwargs override them.
     """
 
     config: PixelSamplerConfig

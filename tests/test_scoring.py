@@ -14,7 +14,7 @@ from torch import Tensor
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.protocol import PixelSampler, TrainingCallbackLocation
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling.scoring import scoring
+from edge_se_sampler.sampling.scoring import build_scorer
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
@@ -27,7 +27,7 @@ def test_candidates_are_scored_a_training_batch_at_a_time(candidates: int, rays:
         return batch["image"].sum(dim=1)
 
     sampler = EdgeSEPixelSampler(EdgeSEPixelSamplerConfig(), num_rays_per_batch=1)
-    score = scoring(sampler, SimpleNamespace(model="the model"), lambda indices: indices * 10, ray_errors)
+    score = build_scorer(sampler, SimpleNamespace(model="the model"), lambda indices: indices * 10, ray_errors)
     sampler.set_num_rays_per_batch(rays)  # hosts change it while they train
     pixels = {
         "indices": torch.arange(3 * candidates).reshape(-1, 3),

@@ -20,7 +20,7 @@ from edge_se_sampler.protocol import (
     TrainingCallbackLocation,
 )
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
-from edge_se_sampler.sampling.scoring import scoring
+from edge_se_sampler.sampling.scoring import build_scorer
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
@@ -86,12 +86,12 @@ class VanillaDataManager:
         return random_rays(camera, np.zeros(n, dtype=np.int64), rng)
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
-        """Bind an important-pixel sampler to the run; the callback tells it the step."""
+        """Bind the pixel sampler to the run; the callback sets its step."""
         sampler, trainer = self.train_pixel_sampler, training_callback_attributes.trainer
         if not isinstance(sampler, ImportantPixels):
             return []
         sampler.bind(
-            squared_error=scoring(
+            squared_error=build_scorer(
                 sampler, training_callback_attributes.pipeline, self.cameras.pixel_rays, self.ray_errors
             ),
             planned_steps=trainer.planned_steps,

@@ -1,4 +1,4 @@
-"""Important pixels in nerfstudio's data manager: ours by config, or any vanilla one by `attach`."""
+"""The pixel sampler in nerfstudio: by the config of its data manager, or attached to a trainer of any method."""
 # pyright: reportMissingImports=false
 # nerfstudio's pins rule out the environment that is linted; here its classes count as unknown
 
@@ -17,7 +17,7 @@ from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEP
 from edge_se_sampler.nerfstudio.resume import planned_steps, restore_schedule, schedule_writer
 from edge_se_sampler.nerfstudio.scoring import get_background_color, observe_training_errors, ray_errors
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
-from edge_se_sampler.sampling.scoring import scoring
+from edge_se_sampler.sampling.scoring import build_scorer
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
@@ -29,7 +29,7 @@ class EdgeSEDataManager(VanillaDataManager):
         shared = self.config.pixel_sampler
         important = isinstance(shared, SamplingSettings)
         if important and self.config.patch_size > 1:
-            raise InputError(f"patch-size is {self.config.patch_size}: important pixels are not drawn in patches")
+            raise InputError(f"patch-size is {self.config.patch_size}: this sampler draws no patches")
         evaluation = dataset is not self.train_dataset
         self.config.pixel_sampler = _uniform_config(shared) if important and evaluation else copy.copy(shared)
         try:
@@ -38,7 +38,7 @@ class EdgeSEDataManager(VanillaDataManager):
             self.config.pixel_sampler = shared
 
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
-        """nerfstudio's callbacks and ours; called once the checkpoint, if there is one, has been loaded."""
+        """nerfstudio's callbacks and the sampler's; called after a checkpoint has been loaded, if there is one."""
         callbacks = super().get_training_callbacks(training_callback_attributes)
         if isinstance(self.train_pixel_sampler, EdgeSEPixelSampler):
             callbacks += _bind_sampler(self, training_callback_attributes.trainer)
@@ -47,7 +47,7 @@ class EdgeSEDataManager(VanillaDataManager):
 
 @dataclass
 class EdgeSEDataManagerConfig(VanillaDataManagerConfig):
-    """nerfstudio's data manager with important-pixel sampling; it suits any method whose model takes rays."""
+    """nerfstudio's data manager with this pixel sampler, for any method whose model takes rays."""
 
     _target: type = field(default_factory=lambda: EdgeSEDataManager)
     pixel_sampler: EdgeSEPixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
@@ -55,7 +55,7 @@ class EdgeSEDataManagerConfig(VanillaDataManagerConfig):
 
 
 def attach(trainer: Any, **settings: Any) -> None:
-    """Train a stock method on important pixels: after trainer.setup(), before trainer.train().
+    """Give a trainer of any nerfstudio method this pixel sampler: after trainer.setup(), before trainer.train().
 
     Args:
         trainer: nerfstudio's, with a VanillaDataManager.
@@ -68,12 +68,12 @@ def attach(trainer: Any, **settings: Any) -> None:
     manager = trainer.pipeline.datamanager
     if not isinstance(manager, VanillaDataManager):
         raise InputError(
-            f"{type(manager).__name__} does not draw its pixels in this process: important pixels need a "
+            f"{type(manager).__name__} does not draw its pixels in this process: this sampler needs a "
             "VanillaDataManager; set config.pipeline.datamanager to an EdgeSEDataManagerConfig instead of attaching"
         )
     sampler = manager.train_pixel_sampler
     if type(sampler) is not PixelSampler:
-        raise InputError(f"the training sampler is a {type(sampler).__name__}: important pixels would not do its work")
+        raise InputError(f"the training sampler is a {type(sampler).__name__}: this sampler cannot replace it")
     config = EdgeSEPixelSamplerConfig(**(_shared_settings(sampler.config) | settings))
     manager.train_pixel_sampler = config.setup(num_rays_per_batch=sampler.num_rays_per_batch)
     trainer.callbacks += _bind_sampler(manager, trainer)
@@ -84,7 +84,7 @@ def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
     sampler, config = manager.train_pixel_sampler, trainer.config
     sampler.background_color = get_background_color(trainer.pipeline.model)
     sampler.bind(
-        squared_error=scoring(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
+        squared_error=build_scorer(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
         planned_steps=planned_steps(trainer),
         seed=config.machine.seed,
         rank=config.machine.machine_rank * config.machine.num_devices + trainer.local_rank,
@@ -104,10 +104,10 @@ def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
 
 
 def _uniform_config(shared: PixelSamplerConfig) -> PixelSamplerConfig:
-    """nerfstudio's own uniform sampler with the settings of ours that it knows."""
+    """nerfstudio's own uniform sampler, with the settings that both have."""
     return PixelSamplerConfig(**_shared_settings(shared))
 
 
 def _shared_settings(config: PixelSamplerConfig) -> dict[str, Any]:
-    """The settings that nerfstudio's sampler and ours have in common."""
+    """The settings that nerfstudio's sampler has too."""
     return {f.name: getattr(config, f.name) for f in fields(PixelSamplerConfig) if f.name != "_target"}

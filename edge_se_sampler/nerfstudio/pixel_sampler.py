@@ -1,4 +1,4 @@
-"""Important-pixel sampling on nerfstudio's own base classes.
+"""The pixel sampler on nerfstudio's base classes.
 
 Imports no more of nerfstudio than its pixel samplers, so that the contract can be tested without a full installation.
 """
@@ -18,19 +18,19 @@ from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 UNBOUND = (
-    "edge-se-sampler: this pixel sampler follows no training run and draws uniformly, as evaluation and export should; "
+    "edge-se-sampler: this pixel sampler is not bound to a training run and draws uniformly, as evaluation should; "
     "to train with it, use EdgeSEDataManagerConfig or attach(trainer)"
 )
-INSTEAD = "take one of nerfstudio's own methods, whose sampler knows them"
+USE_OWN_SAMPLER = "take one of nerfstudio's own methods, whose sampler supports them"
 
 
 @dataclass
 class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
-    """Our settings beside nerfstudio's, because tyro's flags and config.yml want one class that is one of theirs."""
+    """The sampler's settings and nerfstudio's in one class, which its flags and config.yml need."""
 
     _target: type = field(default_factory=lambda: EdgeSEPixelSampler)
     images_per_step: Literal["one", "all"] = "all"
-    """Draw a step's pixels from all images at hand (nerfstudio) or from one image (the paper); an image is chosen
+    """Draw a step's pixels from all loaded images (nerfstudio) or from one image (the paper); an image is chosen
     first, a pixel in it second."""
 
     def check(self) -> None:
@@ -48,16 +48,16 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
             )
         # both come from the cameras: the host's sampler then draws by solid angle, or inside the crop circle alone
         if bool(self.is_equirectangular):
-            raise InputError("the cameras are equirectangular: important pixels suit other cameras only; " + INSTEAD)
+            raise InputError("the cameras are equirectangular: not supported here; " + USE_OWN_SAMPLER)
         if self.fisheye_crop_radius is not None:
-            raise InputError("the cameras have a fisheye_crop_radius: important pixels ignore it; " + INSTEAD)
+            raise InputError("the cameras have a fisheye crop radius: not supported here; " + USE_OWN_SAMPLER)
 
 
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
-    """The same sampling as on our own protocol's base; the host contributes its config and its number of rays."""
+    """The sampler of the standalone program on nerfstudio's base class, with nerfstudio's settings."""
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
-        """As ImportantPixels.sample; a sampler that follows no training run says so, once, and draws uniformly."""
+        """As ImportantPixels.sample; an unbound sampler says once that it draws uniformly."""
         if not self.is_bound and not self._warned:
             self._warned = True
             print(UNBOUND, file=sys.stderr)
@@ -66,8 +66,8 @@ class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
     _warned = False
 
     def __getstate__(self) -> Any:
-        """Refuse to be sent to a worker process (nerfstudio's ParallelDataManager), where no model could be asked."""
+        """Refuse to be sent to a worker process (nerfstudio's ParallelDataManager), which has no model."""
         raise InputError(
-            "a pixel sampler in a worker process knows neither step nor model, and would draw uniformly: set "
+            "a pixel sampler in a worker process has neither the step nor the model, and would draw uniformly: set "
             "config.pipeline.datamanager to an EdgeSEDataManagerConfig instead of a ParallelDataManagerConfig"
         )

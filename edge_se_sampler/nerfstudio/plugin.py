@@ -1,4 +1,4 @@
-"""The methods that `ns-train` offers with important-pixel sampling.
+"""The methods with this pixel sampler that `ns-train` offers.
 
 Must not import nerfstudio.configs.method_configs, which loads this module by its entry points.
 """

@@ -7,12 +7,12 @@ s       strength of a pixel, >= 0 (equation 5: |E| + eps; 0: never drawn)
 p       probability of a pixel within its image, s / sum(s)
 B       children of a node: B consecutive pixels (row-major) make a block, B blocks a superblock
 
-Every draw is an inverse CDF in our own arithmetic. torch.multinomial raises above 2^24 categories and was seen
-to be silently wrong at 2^24; a flat float64 CDF over 100 images of 800 x 800 costs 8 bytes a pixel and a cache
-miss at every step of its search. Three levels keep what a draw touches small: the superblocks' cumulative mass in
-float64, then within a superblock and within a block the children's cumulative shares as 30-bit integers, in which
-search and probabilities are exact. Draws are with replacement. Tables and draws live on the CPU whatever the
-images' device (CUDA's cumulative sums need not be monotone), so that a seed draws the same pixels everywhere.
+Every draw inverts a CDF that is searched here: torch.multinomial raises above 2^24 categories and is silently wrong at
+2^24, and a flat float64 CDF over 100 images of 800 x 800 costs 8 bytes a pixel and a cache miss at every step of its
+search. Three levels keep small what a draw touches: the superblocks' cumulative mass in float64, then within a
+superblock and within a block the children's cumulative shares as 30-bit integers, in which search and probabilities are
+exact. Draws are with replacement. Tables and draws live on the CPU whatever the images' device (CUDA's cumulative sums
+need not be monotone), so that a seed draws the same pixels everywhere.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CDF_SCALE = 2**30
 
 
 class UniformPixels:
-    """Every pixel of the centred box of each image alike: Random (equation 2) or Precrop (equation 3).
+    """Pixels of each image's centered box, all alike: Random (equation 2) or Precrop (equation 3).
 
     Args:
         sizes: (k, 2) rows and columns of each image.
@@ -49,7 +49,14 @@ class UniformPixels:
         return torch.ones(len(images), dtype=torch.bool)
 
     def draw(self, images: Tensor, n: int, rng: np.random.Generator) -> Tensor:
-        """n draws: (n, 3) int64, position in `images`, row, column."""
+        """n draws with replacement.
+
+        Args:
+            images: (k,) int64, numbers of images in the order of `sizes`.
+
+        Returns:
+            (n, 3) int64: position in `images`, row, column.
+        """
         u = torch.from_numpy(rng.random((n, 3)))
         which = (u[:, 0] * len(images)).long()
         image = images[which]
@@ -57,7 +64,7 @@ class UniformPixels:
         return torch.cat((which[:, None], pixel), dim=1)
 
     def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
-        """(n,) p of the drawn pixels times the number of pixels that can be drawn in their image: here 1."""
+        """(n,) p of drawn pixels times the number of drawable pixels of their image: here 1."""
         return torch.ones(len(drawn), dtype=torch.float64)
 
 
@@ -75,7 +82,7 @@ class PixelTable:
         self._shape = np.zeros((0, 2), dtype=np.int64)
         self._first = np.zeros(1, dtype=np.int64)  # superblock at which an image begins, and the end of all
         self._support = np.zeros(0, dtype=np.int64)
-        self._slot = np.zeros(0, dtype=np.int64)  # place in the cumulative mass; -1: no mass at all
+        self._slot = np.zeros(0, dtype=np.int64)  # index among images with mass, which cumulative mass counts; -1: none
 
     def __len__(self) -> int:
         return len(self._shape)
@@ -97,7 +104,7 @@ class PixelTable:
         """
         mass, blocks, pixels, shapes = [self._mass], [self._blocks], [self._pixels], []
         slot, support = self._slot.tolist(), self._support.tolist()
-        filled = sum(place >= 0 for place in slot)
+        filled = sum(index >= 0 for index in slot)
         for strength in strengths:
             share, block_mass = _level(_flat(strength))
             pixels.append(share.numpy())
@@ -156,12 +163,12 @@ class PixelTable:
         return torch.from_numpy(drawn)
 
     def probability(self, image: int) -> Tensor:
-        """p of every pixel of one image as it is really drawn, (H, W) float64; sums to 1, or is all 0."""
+        """p of every pixel of one image as it is drawn, rounding included: (H, W) float64; sums to 1, or is all 0."""
         height, width = self._shape[image].tolist()
         columns = torch.arange(height * width)
         drawn = torch.stack((torch.zeros_like(columns), columns // width, columns % width), dim=1)
-        relative = self.density_ratio(torch.tensor([image]), drawn).reshape(height, width)
-        return relative / max(int(self._support[image]), 1)
+        density_ratio = self.density_ratio(torch.tensor([image]), drawn).reshape(height, width)
+        return density_ratio / max(int(self._support[image]), 1)
 
     def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) p of drawn pixels (as `draw` returns them) times the number of drawable pixels of their image."""

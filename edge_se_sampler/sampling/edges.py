@@ -1,7 +1,7 @@
 """Image -> edge strength: E = |phi(G(I))|, equation 4 of the paper.
 
 I    image, (H, W, 3|4), uint8 or float in [0, 1], sRGB, straight alpha
-G    gray: the colour composited on the background, BT.601 luma, in [0, 1]
+G    gray: the color composited on the background, BT.601 luma, in [0, 1]
 phi  edge operator with replicated borders, scaled so that a full-contrast step edge along an axis answers 1
 E    edge strength, (H, W) float32, finite, >= 0
 """
@@ -42,7 +42,7 @@ def unit_float(image: np.ndarray) -> np.ndarray:
 def luma(image: np.ndarray, background: tuple[float, float, float] = WHITE) -> np.ndarray:
     """BT.601 luma of the image composited on the background, (H, W) float32.
 
-    Under alpha 0 the stored colour is arbitrary, so it never shows: luma is linear, and the background's share
+    Under alpha 0 the stored color is arbitrary, so it never shows: luma is linear, and the background's share
     is added after the weighting.
 
     Args:
@@ -53,8 +53,8 @@ def luma(image: np.ndarray, background: tuple[float, float, float] = WHITE) -> n
     gray = image[..., 0] * np.float32(0.299) + image[..., 1] * np.float32(0.587) + image[..., 2] * np.float32(0.114)
     if image.shape[2] == 3:
         return gray
-    behind = np.float32(np.dot(background, (0.299, 0.587, 0.114)))
-    return behind + image[..., 3] * (gray - behind)
+    background_gray = np.float32(np.dot(background, (0.299, 0.587, 0.114)))
+    return background_gray + image[..., 3] * (gray - background_gray)
 
 
 def _sobel(gray: np.ndarray) -> np.ndarray:
@@ -94,15 +94,15 @@ def edge_strength(
     Args:
         image: (H, W, 3|4), uint8 or float in [0, 1], straight alpha.
         edge_filter: "sobel" sqrt(Gx^2 + Gy^2), "laplacian" |4-neighbour Laplacian|, "canny" 0 or 1.
-        source: edges of the composited colour, of alpha, or the stronger of both (a white object on white has
-            no colour edge).
+        source: edges of the composited color, of alpha, or the stronger of both (a white object on white has
+            no color edge).
         background: RGB behind transparent pixels.
 
     Returns:
         (H, W) float32, finite, >= 0.
 
     Raises:
-        ValueError: a malformed image, or alpha edges asked of an image without alpha.
+        ValueError: a malformed image, or alpha edges of an image without alpha.
     """
     image = unit_float(image)
     if source != "color" and image.shape[2] == 3:

@@ -1,4 +1,4 @@
-"""A host's batch of images, stacked or in lists, seen one way.
+"""A host's batch of images, stacked or in lists, read alike.
 
 k      images in the batch; they carry absolute numbers and may differ in size
 drawn  (n, 3) int64: position in the batch, row, column

@@ -21,13 +21,13 @@ class Stream(IntEnum):
     SELECTION = 2
     """Which candidates squared-error sampling keeps."""
     MODEL = 3
-    """Jitter along the rays, density noise, random backgrounds."""
+    """Jitter of samples along rays, density noise, random backgrounds."""
     WEIGHTS = 4
     """Initial weights of the networks."""
     UNSEEN = 5
-    """Poses and pixels of rays without an image."""
+    """Poses and pixels of unseen rays (InfoNeRF)."""
     PROBE = 6
-    """Rays that a network is probed on."""
+    """Rays that show whether a network is dead."""
 
 
 def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Generator:
@@ -36,7 +36,7 @@ def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Ge
     Args:
         seed: any integer; taken modulo 2^64.
         step: >= 0.
-        rank: of a distributed run's process, where each needs numbers of its own.
+        rank: of the process in a distributed run, where each needs numbers of its own.
     """
     key = np.array([seed % 2**64, int(purpose)], dtype=np.uint64)
     counter = np.array([0, step, rank, 0], dtype=np.uint64)

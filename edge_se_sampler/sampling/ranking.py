@@ -1,4 +1,4 @@
-"""Squared errors -> ranks -> kept candidates: equations 6 and 7 of the paper.
+"""Squared errors -> ranks -> selected candidates: equations 6 and 7 of the paper.
 
 m      candidates, drawn uniformly (the paper: m = 2N)
 N      candidates kept for training

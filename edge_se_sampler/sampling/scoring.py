@@ -1,4 +1,4 @@
-"""What squared-error sampling needs of a data manager, of any host: the model's errors on candidate pixels."""
+"""Squared errors of a model, of any host, at candidate pixels."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ RayErrors = Callable[[Any, Any, dict[str, Tensor]], Tensor]
 """Model, ray bundle (n rays), batch -> (n,) squared errors of the model's fine colours on the batch's pixels."""
 
 
-def scoring(
+def build_scorer(
     sampler: ImportantPixels, pipeline: Any, ray_generator: Callable[[Tensor], Any], ray_errors: RayErrors
 ) -> SquaredError:
-    """How a sampler's candidates are scored: a training batch at a time, so that it takes no more memory than training.
+    """A function that renders a sampler's candidates and returns their squared errors, for `ImportantPixels.bind`.
+
+    It renders a training batch at a time, so that it takes no more memory than training.
 
     Args:
         sampler: its number of rays, which hosts may change at any time, is the size of a batch.
-        pipeline: whose `model` is asked. It must not be kept on a data manager: nerfstudio's is a module, and would
-            count the model's weights as its own.
+        pipeline: whose `model` is rendered. It must not be an attribute of a data manager: nerfstudio's is a module,
+            and would count the model's weights as its own.
         ray_generator: (n, 3) indices -> ray bundle.
-        ray_errors: how this host compares a rendered ray.
+        ray_errors: compares rendered rays with their pixels.
     """
 
     @torch.no_grad()

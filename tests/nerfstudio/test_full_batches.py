@@ -197,4 +197,4 @@ def test_a_data_manager_that_does_not_bind_it_is_told(host_scene: Path, tmp_path
     assert type(manager) is VanillaDataManager
     for step in range(3):
         manager.next_train(step)
-    assert capfd.readouterr().err.count("follows no training run and draws uniformly") == 1
+    assert capfd.readouterr().err.count("is not bound to a training run and draws uniformly") == 1

@@ -73,13 +73,13 @@ def test_render(trained: dict[str, Path], tmp_path: Path) -> None:
 
 
 def test_export(trained: dict[str, Path], tmp_path: Path) -> None:
-    """It draws from the training sampler, which follows no run then: uniformly, and it says so."""
+    """It draws from the training sampler, which is unbound then: uniformly, and with a warning."""
     for needed in ("open3d", "pymeshlab", "xatlas"):
         pytest.importorskip(needed, reason="ns-export needs it", exc_type=ImportError)
     config = trained["edge-se-nerfacto"] / "config.yml"
     said = ns("export", "pointcloud", "--load-config", config, "--output-dir", tmp_path, "--num-points", "500",
               "--num-rays-per-batch", "256", "--remove-outliers", "False", "--normal-method", "open3d")  # fmt: skip
-    assert "follows no training run and draws uniformly" in said
+    assert "is not bound to a training run and draws uniformly" in said
     assert (tmp_path / "point_cloud.ply").stat().st_size > 0
 
 
