@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.occupancy import hull as hull_module
-from edge_se_sampler.occupancy import scene_analysis as economy
+from edge_se_sampler.occupancy import scene_analysis
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
 from edge_se_sampler.occupancy.hull import (
     BEHIND,
@@ -26,13 +25,14 @@ from edge_se_sampler.occupancy.hull import (
     STRADDLING,
     Box,
     Hull,
-    box_of,
     carve,
-    footprint,
-    projected,
-    silhouettes,
+    find_box,
+    find_hit_pixels,
+    find_silhouettes,
+    pixel_footprint,
+    project_cells,
 )  # fmt: skip
-from edge_se_sampler.occupancy.scene_analysis import MAX_GRID_CELLS, live_pixels, spread_pixels
+from edge_se_sampler.occupancy.scene_analysis import MAX_GRID_CELLS, pick_pixels
 
 VIEWS = 12
 
@@ -85,8 +85,8 @@ def with_masks(views: Views, change: Callable[[int, np.ndarray], np.ndarray]) ->
 
 
 def hull_of(views: Views, voxel_size_px: float = 1.6) -> Hull:
-    box = box_of(views, 2, 6)
-    hull = carve(views, silhouettes(views), box, voxel_size_px * footprint(views, box))
+    box = find_box(views, 2, 6)
+    hull = carve(views, find_silhouettes(views), box, voxel_size_px * pixel_footprint(views, box))
     assert hull is not None
     return hull
 
@@ -99,7 +99,7 @@ def missed(views: Views, hull: Hull) -> int:
     )
     count = 0
     for chunk in torch.from_numpy(pixels).split(4096):
-        samples = grid.march(cameras.pixel_rays(chunk), hull.side / 8, None)
+        samples = grid.march(cameras.pixel_rays(chunk), hull.cell_size / 8, None)
         count += int((torch.bincount(samples.ray_indices, minlength=len(chunk)) == 0).sum())
     return count
 
@@ -113,11 +113,11 @@ def test_the_box_is_where_the_cameras_look_and_as_large_as_their_depths() -> Non
         views,
         camera_to_worlds=views.cameras.camera_to_worlds + torch.tensor([[0, 0, 0, 5], [0, 0, 0, -2], [0, 0, 0, 1]]),
     )
-    box = box_of(moved, 2.5, 6)
+    box = find_box(moved, 2.5, 6)
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3], axis=1)
-    np.testing.assert_allclose(box.middle, (5, -2, 1), atol=1e-9)
-    assert box.half == pytest.approx(max((6 - distance).max(), (distance - 2.5).max()))
-    assert footprint(moved, box) == pytest.approx(np.median(distance) / 137)
+    np.testing.assert_allclose(box.center, (5, -2, 1), atol=1e-9)
+    assert box.half_extent == pytest.approx(max((6 - distance).max(), (distance - 2.5).max()))
+    assert pixel_footprint(moved, box) == pytest.approx(np.median(distance) / 137)
 
 
 @pytest.mark.parametrize("apart", [0.02, -0.005])
@@ -130,18 +130,18 @@ def test_cameras_side_by_side_look_at_what_is_before_them(apart: float) -> None:
     position = np.stack((np.linspace(-0.5, 0.5, 5), np.zeros(5), np.full(5, 3.0)), axis=1)
     poses = np.stack((right, np.broadcast_to((0.0, 1.0, 0.0), right.shape), -ahead, position), axis=2)
     side = with_cameras(views, camera_to_worlds=torch.from_numpy(poses))
-    box = box_of(side, 2, 6)
-    np.testing.assert_allclose(box.middle, (0, 0, -1), atol=0.01)  # 4 ahead of them
-    assert box.half == pytest.approx(2, abs=0.1)
-    assert footprint(side, box) == pytest.approx(4 / 137, rel=0.01)
+    box = find_box(side, 2, 6)
+    np.testing.assert_allclose(box.center, (0, 0, -1), atol=0.01)  # 4 ahead of them
+    assert box.half_extent == pytest.approx(2, abs=0.1)
+    assert pixel_footprint(side, box) == pytest.approx(4 / 137, rel=0.01)
 
 
 def test_a_rectangle_holds_all_of_its_cell() -> None:
     views, rng = views_of(rods()), np.random.default_rng(1)
     centers, side = rng.uniform(-1.5, 1.5, (500, 3)), 0.4
     for number in range(VIEWS):
-        low, high, where = projected(views.cameras, number, centers, side)
-        assert (where == IN_FRONT).all()
+        low, high, side_of_plane = project_cells(views.cameras, number, centers, side)
+        assert (side_of_plane == IN_FRONT).all()
         pose = views.cameras.camera_to_worlds[number].numpy()
         worst = []
         for corner in np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3):
@@ -157,7 +157,7 @@ def test_a_cell_around_a_camera_is_not_judged_by_it() -> None:
     views = views_of(rods())
     pose = views.cameras.camera_to_worlds[0].numpy()
     centers = pose[:, 3] - np.array([[0.0], [1.0], [-1.0]]) * pose[:, 2]
-    assert projected(views.cameras, 0, centers, 0.5)[2].tolist() == [STRADDLING, IN_FRONT, BEHIND]
+    assert project_cells(views.cameras, 0, centers, 0.5)[2].tolist() == [STRADDLING, IN_FRONT, BEHIND]
 
 
 # -- nothing that is seen goes
@@ -168,7 +168,7 @@ def test_no_foreground_pixel_loses_its_cells(size: int) -> None:
     views = views_of(rods(), size, 12 if size == 100 else 4)
     hull = hull_of(views, 1.6 if size == 100 else 6)
     assert missed(views, hull) == 0
-    assert hull.cells.sum() * hull.side**3 < (0.6 if size == 100 else 0.4)  # of 64: rods, a ball, and a margin
+    assert hull.cells.sum() * hull.cell_size**3 < (0.6 if size == 100 else 0.4)  # of 64: rods, a ball, and a margin
 
 
 def eroded(_: int, alpha: np.ndarray) -> np.ndarray:
@@ -212,30 +212,24 @@ def test_without_margin_or_witnesses_they_would(
 ) -> None:
     views = views_of(rods())
     monkeypatch.setattr(hull_module, name, value)
-    if name == "MARGIN":  # an empty slice otherwise
-        monkeypatch.setattr(hull_module, "_silhouette", lambda mask: _whole(mask))
     assert missed(views, hull_of(with_masks(views, damage))) > 0
 
 
-def _whole(mask: np.ndarray) -> Any:
-    return hull_module.Silhouette(cv2.integral(mask.astype(np.uint8)), True)
-
-
-@pytest.mark.parametrize("fewer", [0.0, 2.0])
-def test_cells_that_are_known_to_be_empty_may_be_dropped(fewer: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("fraction", [0.0, 2.0])
+def test_cells_that_are_known_to_be_empty_may_be_dropped(fraction: float, monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(rods(), 60)
     expected = hull_of(views)
-    monkeypatch.setattr(hull_module, "FEWER", fewer)  # never, always
+    monkeypatch.setattr(hull_module, "MIN_CANDIDATES", fraction)  # never, always
     found = hull_of(views)
     np.testing.assert_array_equal(found.cells, expected.cells)
-    np.testing.assert_array_equal(found.corner, expected.corner)
+    np.testing.assert_array_equal(found.aabb_min, expected.aabb_min)
 
 
 def test_hundreds_of_views_carve_as_a_few_do(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as a byte cannot count."""
     views = views_of(rods(), 40, 4)
     often = views.subset([*range(4)] * 64)
-    monkeypatch.setattr(hull_module, "FEWER", 0.0)
+    monkeypatch.setattr(hull_module, "MIN_CANDIDATES", 0.0)
     monkeypatch.setattr(hull_module, "MIN_EMPTY_VIEWS", 1)
     np.testing.assert_array_equal(hull_of(often).cells, hull_of(views).cells)
 
@@ -254,17 +248,17 @@ def test_what_an_image_cuts_off_is_kept() -> None:
     """A long rod leaves every image: the views know nothing of what lies outside."""
     points = np.linspace(-1, 1, 8000)[:, None] * (0, 0, 1.9)
     views = views_of(points, focal=2.2)
-    assert not any(shape.whole for shape in silhouettes(views).values())
+    assert not any(shape.uncropped for shape in find_silhouettes(views).values())
     hull = hull_of(views)
     kept = OccupancyGrid.from_hull(hull).contains(torch.from_numpy(points).float()).numpy()
     seen = np.zeros(len(points), dtype=bool)
     for number in range(VIEWS):
-        low, high, _ = projected(views.cameras, number, points, 1e-6)
+        low, high, _ = project_cells(views.cameras, number, points, 1e-6)
         seen |= ((low > 0) & (high < 100)).all(axis=0)
     assert 0.5 < seen.mean() < 1
     assert kept[seen].all()
     inside = views_of(points * 0.3, focal=2.2)
-    assert all(shape.whole for shape in silhouettes(inside).values())
+    assert all(shape.uncropped for shape in find_silhouettes(inside).values())
 
 
 # -- without alpha, and how much there is
@@ -276,9 +270,9 @@ def test_without_a_background_all_that_views_see_is_kept(opaque: bool) -> None:
     images = tuple(image[..., :3] if opaque else np.full_like(image, 255) for image in views.images)
     plain = replace(views, images=images)
     analysis = analyze_views(plain, LeanModelConfig())
-    assert analysis.silhouettes == 0
-    middle = analysis.hull.corner + np.array(analysis.hull.cells.shape) * analysis.hull.side / 2
-    np.testing.assert_allclose(middle, 0, atol=analysis.hull.side)
+    assert analysis.num_silhouettes == 0
+    middle = analysis.hull.aabb_min + np.array(analysis.hull.cells.shape) * analysis.hull.cell_size / 2
+    np.testing.assert_allclose(middle, 0, atol=analysis.hull.cell_size)
     grid = OccupancyGrid.from_hull(analysis.hull)
     rng = np.random.default_rng(0)
     assert bool(grid.contains(torch.from_numpy(rng.uniform(-1, 1, (1000, 3))).float()).all())
@@ -291,7 +285,7 @@ def test_a_cell_behind_a_camera_is_not_seen_by_it() -> None:
     pose = views.cameras.camera_to_worlds[0].numpy()
     hull = carve(views, {}, Box(pose[:, 3], 1.0), 0.1)
     assert hull is not None
-    centers = hull.corner + (np.argwhere(hull.cells) + 0.5) * hull.side
+    centers = hull.aabb_min + (np.argwhere(hull.cells) + 0.5) * hull.cell_size
     depth = -(centers - pose[:, 3]) @ pose[:, 2]
     assert depth.min() > -0.1 * np.sqrt(3)
     assert depth.max() > 1
@@ -302,7 +296,7 @@ def test_a_sparse_scene_has_no_grid_without_bounds(monkeypatch: pytest.MonkeyPat
     specks = rods()[-2000:] * 0.02
     views = views_of(np.concatenate((specks + 0.8, specks - 0.8)), 400)
     free = analyze_views(views, LeanModelConfig(voxel_size_px=0.7)).hull
-    monkeypatch.setattr(economy, "MAX_GRID_CELLS", 2**18)
+    monkeypatch.setattr(scene_analysis, "MAX_GRID_CELLS", 2**18)
     bound = analyze_views(views, LeanModelConfig(voxel_size_px=0.7)).hull
     assert free.cells.size > 2**20
     assert bound.cells.size <= 1.2 * 2**18
@@ -319,10 +313,10 @@ def test_cameras_that_see_nothing_are_refused_in_one_line() -> None:
 def test_a_part_that_is_off_does_not_carve() -> None:
     views = views_of(rods())
     carved, whole = (analyze_views(views, LeanModelConfig(cull_by_alpha=on)) for on in (True, False))
-    assert carved.silhouettes == VIEWS
-    assert whole.silhouettes == 0
-    assert carved.hull.cells.sum() * carved.hull.side**3 < 0.02 * whole.hull.cells.sum() * whole.hull.side**3
-    assert analyze_views(views, LeanModelConfig(empty_space_skipping=False)).silhouettes == 0
+    assert carved.num_silhouettes == VIEWS
+    assert whole.num_silhouettes == 0
+    assert carved.hull.cells.sum() * carved.hull.cell_size**3 < 0.02 * whole.hull.cells.sum() * whole.hull.cell_size**3
+    assert analyze_views(views, LeanModelConfig(empty_space_skipping=False)).num_silhouettes == 0
 
 
 @pytest.mark.parametrize("apart", [0, 30])
@@ -334,7 +328,7 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
         return np.roll(alpha, (apart * (-1) ** i, apart * (-1) ** (i // 2)), axis=(0, 1))
 
     analysis = analyze_views(with_masks(views, moved), LeanModelConfig())
-    assert (analysis.silhouettes == 0) == bool(apart)
+    assert (analysis.num_silhouettes == 0) == bool(apart)
     assert capfd.readouterr().err.count("do not agree") == bool(apart)
     assert missed(views, analysis.hull) == 0
 
@@ -342,9 +336,9 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
 def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:
     views = views_of(rods())
     fine = analyze_views(views, LeanModelConfig(voxel_size_px=1.6))
-    assert fine.hull.side == pytest.approx(1.6 * fine.footprint)
+    assert fine.hull.cell_size == pytest.approx(1.6 * fine.pixel_footprint)
     many = analyze_views(views_of(rods(), 800, 4), LeanModelConfig(voxel_size_px=0.2))
-    assert many.hull.side > 0.2 * many.footprint
+    assert many.hull.cell_size > 0.2 * many.pixel_footprint
     assert 0.05 * MAX_OCCUPIED_CELLS < many.hull.cells.sum() < MAX_OCCUPIED_CELLS
 
 
@@ -356,17 +350,17 @@ def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int,
     assert analysis.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS / 8
     assert analysis.hull.cells.size * 8**analysis.max_level < MAX_GRID_CELLS
     if size == 100:  # as near as halving comes to what a pixel asks
-        assert 2**-0.5 < analysis.hull.side / 2**max_level / analysis.footprint < 2**0.5
-    for settled in (
+        assert 2**-0.5 < analysis.hull.cell_size / 2**max_level / analysis.pixel_footprint < 2**0.5
+    for unpruned in (
         analyze_views(views, LeanModelConfig(cull_by_density=False)),
         analyze_views(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
         analyze_views(views, LeanModelConfig(empty_space_skipping=False)),
         analyze_views(views, NeRFModelConfig(empty_space_skipping=True)),
     ):
-        assert (settled.max_level, settled.coarsening) == (0, 0)
+        assert (unpruned.max_level, unpruned.coarsening) == (0, 0)
     carved = analyze_views(views, LeanModelConfig())
     assert (carved.max_level, carved.coarsening) == (1, 1)
-    assert float(carved.grid().cell_size) == pytest.approx(2 * carved.hull.side)
+    assert float(carved.grid().cell_size) == pytest.approx(2 * carved.hull.cell_size)
 
 
 # -- live pixels
@@ -377,9 +371,9 @@ def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
     hull = hull_of(views)
     grid, cameras = OccupancyGrid.from_hull(hull), views.cameras.to(dtype=torch.float32)
     dead = 0
-    for number, live in enumerate(live_pixels(views, hull)):
+    for number, live in enumerate(find_hit_pixels(views, hull)):
         rays = cameras.image_rays(number)
-        meets = torch.bincount(grid.march(rays, hull.side / 4, None).ray_indices, minlength=len(rays)).numpy() > 0
+        meets = torch.bincount(grid.march(rays, hull.cell_size / 4, None).ray_indices, minlength=len(rays)).numpy() > 0
         assert not (meets & ~live.reshape(-1)).any()
         dead += (live.reshape(-1) & ~meets).mean()
     assert 0 < dead / VIEWS < 0.1
@@ -393,21 +387,21 @@ def test_what_lies_behind_or_beside_an_image_makes_no_pixel_live() -> None:
     behind = pose[:, 3] + pose[:, 2]
     for center in (aside, behind):
         hull = Hull(center - 0.05, 0.1, np.ones((1, 1, 1), dtype=bool))
-        assert not live_pixels(views, hull)[0].any()
+        assert not find_hit_pixels(views, hull)[0].any()
     close = Hull(pose[:, 3] - 0.08 * pose[:, 2] - 0.05, 0.1, np.ones((1, 1, 1), dtype=bool))
-    assert live_pixels(views, close)[0].all()
+    assert find_hit_pixels(views, close)[0].all()
 
 
 def test_pixels_are_spread_over_masks_of_any_size() -> None:
     masks = {3: np.zeros((4, 5), dtype=bool), 1: np.ones((2, 3), dtype=bool), 7: np.eye(3, dtype=bool)}
-    all_of_them = spread_pixels(masks, 100).tolist()
+    all_of_them = pick_pixels(masks, 100).tolist()
     assert all_of_them == [[1, r, c] for r in range(2) for c in range(3)] + [[7, i, i] for i in range(3)]
-    assert spread_pixels(masks, 3).tolist() == [[1, 0, 0], [1, 1, 1], [7, 2, 2]]
+    assert pick_pixels(masks, 3).tolist() == [[1, 0, 0], [1, 1, 1], [7, 2, 2]]
 
 
 def test_a_camera_inside_of_the_hull_may_train_on_all_its_pixels() -> None:
     views = views_of(rods())
     box = Box(np.zeros(3), 2.0)
     around = Hull(np.full(3, -6.0), 12.0, np.ones((1, 1, 1), dtype=bool))
-    assert all(live.all() for live in live_pixels(views, around))
-    assert box.half == 2
+    assert all(live.all() for live in find_hit_pixels(views, around))
+    assert box.half_extent == 2

@@ -28,8 +28,7 @@ from edge_se_sampler.models import lean
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import UPDATE_INTERVAL, LeanModel
 from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.hull import Hull
-from edge_se_sampler.occupancy.scene_analysis import live_pixels
+from edge_se_sampler.occupancy.hull import Hull, find_hit_pixels
 
 RAYS = 12
 JUDGE_FROM = 2 * UPDATE_INTERVAL
@@ -83,7 +82,7 @@ def test_culled_rendering_equals_dense_rendering_of_zeros_outside(
     """The same samples in a box that is wholly occupied, their density set to 0 outside of the ball."""
     hull = ball()
     culled = model_in(hull).eval()
-    whole = model_in(Hull(hull.corner, SIDE, np.ones_like(hull.cells))).eval()
+    whole = model_in(Hull(hull.aabb_min, SIDE, np.ones_like(hull.cells))).eval()
     whole.fine.load_state_dict(culled.fine.state_dict())
     one, other = culled.features, whole.features
     assert one is not None
@@ -212,7 +211,7 @@ def test_a_state_brings_its_cells() -> None:
 def test_grids_of_other_scenes_are_told_apart() -> None:
     """As many corners, elsewhere: features would be read at the wrong ones without a word."""
     model, mirrored = model_in(ball()), ball()
-    one = model_in(replace(mirrored, corner=mirrored.corner + 1e-3))
+    one = model_in(replace(mirrored, aabb_min=mirrored.aabb_min + 1e-3))
     mirrored.cells[0] = False
     mirrored.cells[0, 4, 4] = True
     for other in (one, model_in(mirrored)):
@@ -291,7 +290,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
 def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
     analysis = analyze_views(read_blender(larger, "train"), trainer.config.pipeline.model)
-    assert (analysis.max_level, analysis.silhouettes) == (1, 0)
+    assert (analysis.max_level, analysis.num_silhouettes) == (1, 0)
     assert cells(trainer.pipeline.model).is_of_the_same_scene(
         OccupancyGrid.from_hull(analysis.hull, analysis.max_level)
     )
@@ -351,21 +350,24 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     analysis = analyze_views(read_blender(larger, "train"), LeanModelConfig())
     assert f"{analysis.hull.cells.sum():,} of" in said["cells"]
     assert said["silhouettes"].startswith("6 of 6 views")
-    assert said["pixel"].startswith(f"{analysis.footprint:.4f}")
-    live = live_pixels(read_blender(larger, "train"), analysis.hull)
+    assert said["pixel"].startswith(f"{analysis.pixel_footprint:.4f}")
+    live = find_hit_pixels(read_blender(larger, "train"), analysis.hull)
     assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
     assert said["sampling"].startswith("uniform")
-    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.footprint
+    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.pixel_footprint
     assert wave > 2  # pixels: no more than the cameras resolve
     assert said["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
     assert said["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
     large = analyze_views(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
-    assert f"training begins with {large.hull.side:.4f}, split to {large.hull.side / 2:.4f} where" in unlocated
     assert (
-        f"training begins with {2 * analysis.hull.side:.4f}, split to {analysis.hull.side:.4f} where" in said["cells"]
+        f"training begins with {large.hull.cell_size:.4f}, split to {large.hull.cell_size / 2:.4f} where" in unlocated
+    )
+    assert (
+        f"training begins with {2 * analysis.hull.cell_size:.4f}, split to {analysis.hull.cell_size:.4f} where"
+        in said["cells"]
     )
     whole = large.hull.cells
     assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated

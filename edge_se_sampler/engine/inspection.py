@@ -13,7 +13,8 @@ from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.models.config import LeanModelConfig, size_for
 from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, live_pixels, spread_pixels
+from edge_se_sampler.occupancy.hull import find_hit_pixels
+from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
 from edge_se_sampler.sampling.edges import unit_float
 
 NUM_RAYS = 4096
@@ -36,37 +37,42 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     config = replace(config, size=size_for(longest) if config.size == "auto" else config.size)
     config.check()
     analysis = analyze_views(views, config)
-    live = live_pixels(views, analysis.hull)
+    hit_pixels = find_hit_pixels(views, analysis.hull)
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
     _draw_hull(axes[0], analysis)
-    _draw_views(axes[1], views, live)
+    _draw_views(axes[1], views, hit_pixels)
     figure.tight_layout()
     save_figure(figure, path)
-    return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, live, config).items())
+    return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, hit_pixels, config).items())
 
 
-def _findings(views: Views, analysis: SceneAnalysis, live: list[np.ndarray], config: LeanModelConfig) -> dict[str, str]:
+def _findings(
+    views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
+) -> dict[str, str]:
     """Each quantity's value, and where it comes from."""
-    hull, box, preset = analysis.hull, analysis.box, config.preset
+    hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.pixel_footprint
+    num_views = len(views.images)
     sizes = sorted({image.shape[1::-1] for image in views.images})
-    num_cells = max(hull.cells.size, (2 * box.half / hull.side) ** 3)  # large cells may reach beyond the box
-    first = hull.side * 2**analysis.coarsening
+    num_cells = max(
+        hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3
+    )  # large cells may reach beyond the box
+    num_occupied = hull.cells.sum()
+    first = hull.cell_size * 2**analysis.coarsening
     finest = first / 2**analysis.max_level
-    in_hull, along_box = _samples_per_ray(views, analysis, live, config)
-    distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.middle, axis=1)
-    center = ", ".join(f"{value + 0.0:.2f}" for value in box.middle.round(2))
-    share = np.mean(np.concatenate([pixels.ravel() for pixels in live]))
+    in_hull, along_box = _samples_per_ray(views, analysis, hit_pixels, config)
+    distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
+    center = ", ".join(f"{value + 0.0:.2f}" for value in box.center.round(2))
+    share = np.mean(np.concatenate([pixels.ravel() for pixels in hit_pixels]))
     half_extent = float(analysis.grid().half_extent)
-    wave = 2 * np.pi * half_extent / 2 ** (preset.position_frequencies - 1) / analysis.footprint
+    wave = 2 * np.pi * half_extent / 2 ** (preset.position_frequencies - 1) / footprint
     return {
-        "views": f"{len(views.images)} of {' and '.join(f'{w} x {h}' for w, h in sizes)}, {np.median(distance):.2f} "
+        "views": f"{num_views} of {' and '.join(f'{w} x {h}' for w, h in sizes)}, {np.median(distance):.2f} "
         f"from what they look at, ({center})",
-        "pixel": f"{analysis.footprint:.4f} wide there: distance / focal length",
-        "box": f"{2 * box.half:.2f} a side: as deep as rays are sampled",
-        "silhouettes": f"{analysis.silhouettes} of {len(views.images)} views tell the object from its background by "
-        "alpha",
-        "cells": f"{hull.side:.4f} a side, {hull.side / analysis.footprint:.1f} pixels; {hull.cells.sum():,} of "
-        f"{num_cells:,.0f} may hold something ({100 * hull.cells.sum() / num_cells:.1f} %)"
+        "pixel": f"{footprint:.4f} wide there: distance / focal length",
+        "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
+        "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",
+        "cells": f"{hull.cell_size:.4f} a side, {hull.cell_size / footprint:.1f} pixels; {num_occupied:,} of "
+        f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)"
         + (f"; training begins with {first:.4f}, split to {finest:.4f} where it sees any" if first > finest else ""),
         "encoding": f"{preset.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; "
         f"what is finer is left to {config.feature_dim} features at every corner of a cell",
@@ -75,37 +81,37 @@ def _findings(views: Views, analysis: SceneAnalysis, live: list[np.ndarray], con
         "rays": f"{100 * share:.1f} % of the pixels may cross them; such a ray has {in_hull:.1f} samples, "
         f"{along_box:.0f} along all of its depth",
         "sampling": "uniform among them"
-        if analysis.silhouettes
+        if analysis.num_silhouettes
         else "by edges as long as they pay, for nothing tells where the object is",
     }
 
 
 def _samples_per_ray(
-    views: Views, analysis: SceneAnalysis, live: list[np.ndarray], config: LeanModelConfig
+    views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
 ) -> tuple[float, float]:
     """Samples of a ray that crosses the hull: in its cells, a mean over some rays, and along the box's edge."""
-    step = config.step_size_voxels * analysis.hull.side
-    pixels = spread_pixels(dict(enumerate(live)), NUM_RAYS)
+    step = config.step_size_voxels * analysis.hull.cell_size
+    pixels = pick_pixels(dict(enumerate(hit_pixels)), NUM_RAYS)
     rays = views.cameras.to(dtype=torch.float32).pixel_rays(pixels)
     samples = OccupancyGrid.from_hull(analysis.hull).march(rays, step, None, (config.near, config.far))
-    return len(samples.t) / len(pixels), 2 * analysis.box.half / step
+    return len(samples.t) / len(pixels), 2 * analysis.box.half_extent / step
 
 
 def _draw_hull(axes: np.ndarray, analysis: SceneAnalysis) -> None:
     """The hull seen along three axes: how many cells lie one after another."""
     hull = analysis.hull
-    ends = hull.corner + np.array(hull.cells.shape) * hull.side
+    ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
     for axis, along, (right, up) in zip(axes, (1, 0, 2), ((0, 2), (1, 2), (0, 1)), strict=True):
-        extent = (hull.corner[right], ends[right], hull.corner[up], ends[up])
+        extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
         axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
         axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
 
 
-def _draw_views(axes: np.ndarray, views: Views, live: list[np.ndarray]) -> None:
+def _draw_views(axes: np.ndarray, views: Views, hit_pixels: list[np.ndarray]) -> None:
     """Some views, with the pixels dark whose rays miss the hull."""
     chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
     for axis, k in zip(axes, chosen, strict=True):
         image = unit_float(views.images[k])
         color = image[..., :3] * image[..., 3:] + 1 - image[..., 3:] if image.shape[2] == 4 else image
-        axis.imshow(np.where(live[k][..., None], color, 0.25 * color), interpolation="nearest")
+        axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
         axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")

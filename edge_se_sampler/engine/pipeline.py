@@ -15,7 +15,8 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene, live_pixels
+from edge_se_sampler.occupancy.hull import find_hit_pixels
+from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
 
@@ -46,14 +47,14 @@ class Pipeline:
         grid, has_masks = saved_grid, False
         if model_config.needs_grid:
             analysis = analyze_views(views, model_config)
-            grid, has_masks = analysis.grid(), analysis.silhouettes > 0
+            grid, has_masks = analysis.grid(), analysis.num_silhouettes > 0
             if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
                 raise InputError(
                     "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
                     "this machine rounds otherwise; resume with what it began with, or train anew"
                 )
             if manager_config.skip_empty_rays and has_masks:
-                views = views.with_masks(live_pixels(views, analysis.hull))
+                views = views.with_masks(find_hit_pixels(views, analysis.hull))
         if isinstance(manager_config.pixel_sampler, SamplingSettings):
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do

@@ -88,7 +88,9 @@ class OccupancyGrid(nn.Module):
         rim = 2**coarsening
         ends = [rim + -size % rim for size in reversed(hull.cells.shape)]
         cells = F.pad(torch.from_numpy(hull.cells), [size for end in ends for size in (rim, end)])
-        return cls(torch.from_numpy(hull.corner - rim * hull.side), rim * hull.side, cells, max_level, coarsening)
+        return cls(
+            torch.from_numpy(hull.aabb_min - rim * hull.cell_size), rim * hull.cell_size, cells, max_level, coarsening
+        )
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor]) -> OccupancyGrid:
