@@ -25,12 +25,11 @@ class Demo:
     """Seed of weights, pixels and jitter; both methods start from the same weights."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.demo import METHODS, demo
+        from edge_se_sampler.bench.demo import METHODS, run_demo
 
-        for outcome in demo(self.output_dir, self.seed):
-            print(
-                f"{METHODS[outcome.method]:>9}: {outcome.results['psnr']:.2f} dB in {outcome.seconds:.0f} s of training"
-            )
+        for method, measured in run_demo(self.output_dir, self.seed)["methods"].items():
+            psnr, seconds = measured["results"]["psnr"], measured["training_seconds"]
+            print(f"{METHODS[method]:>9}: {psnr:.2f} dB in {seconds:.0f} s of training")
         print(f"see {self.output_dir / 'demo.png'} and {self.output_dir / 'demo.json'}")
 
 

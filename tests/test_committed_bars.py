@@ -65,7 +65,7 @@ def test_every_variant_of_the_chart_was_trained_with_three_seeds():
 @pytest.mark.parametrize("method", demo.METHODS)
 def test_the_demo_comes_out_again(method: str, tmp_path: Path):
     """Its first 40 steps, on whatever machine this is: rounding grows with the steps, so the bound is loose."""
-    trainer = demo.demo_trainer(method, demo.make_demo_scene(tmp_path), tmp_path / "runs", seed=0)
+    trainer = demo.build_trainer(method, demo.render_scene(tmp_path), tmp_path / "runs", seed=0)
     losses = [trainer.train_iteration(step) for step in range(41)]
     for line in result("demo/seed-0/demo.json")["methods"][method]["loss"][:5]:
         assert math.isclose(losses[line["step"]], line["loss"], rel_tol=0.02), line

@@ -15,7 +15,7 @@ from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, failed
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Trial
 from edge_se_sampler.bench.statistics import wilson_interval
-from edge_se_sampler.bench.tables import describe_machine, markdown_table
+from edge_se_sampler.bench.tables import describe_command, markdown_table
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 
 FAILURE_MODES = {
@@ -76,8 +76,7 @@ Failed trainings, with the 95% Wilson interval of the rate, and how they failed.
 {pictures.get("failures", "")}
 ## Reproduce
 
-`{result["command"]}` trains what `result.json` lacks: an hour and a half on two cores for
-ten seeds. Measured on {describe_machine(result["machine"])}.
+{describe_command(result)}
 """
 
 
