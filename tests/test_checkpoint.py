@@ -1,4 +1,4 @@
-"""Checkpoints: whole or not there, and never a pickle."""
+"""Checkpoints: written completely or not at all, and never an arbitrary pickle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def state(value: float, digest: str = "d") -> dict:
     return {"step": 1, "config_digest": digest, "model": {"w": torch.full((50, 50), value)}}
 
 
-def test_what_is_saved_is_loaded_and_older_ones_go(tmp_path: Path):
+def test_the_latest_checkpoint_is_loaded_and_older_ones_are_deleted(tmp_path: Path):
     save_checkpoint(tmp_path, 9, state(1.0))
     save_checkpoint(tmp_path, 19, state(2.0))
     assert [path.name for path in tmp_path.iterdir()] == ["step-000000019.ckpt"]
@@ -31,7 +31,7 @@ def test_what_is_saved_is_loaded_and_older_ones_go(tmp_path: Path):
     assert torch.equal(loaded["model"]["w"], torch.full((50, 50), 2.0))
 
 
-def test_the_latest_is_by_number_not_by_name_or_time(tmp_path: Path):
+def test_the_latest_checkpoint_has_the_highest_step(tmp_path: Path):
     for step in (999, 5):
         (tmp_path / f"step-{step:09d}.ckpt").write_bytes(b"")
     (tmp_path / "step-1000000000.ckpt").write_bytes(b"")
@@ -40,7 +40,7 @@ def test_the_latest_is_by_number_not_by_name_or_time(tmp_path: Path):
 
 
 @pytest.mark.parametrize("position", [0, 30, 84, 85, 200, -1])
-def test_one_flipped_byte_is_refused(tmp_path: Path, position: int):
+def test_a_flipped_bit_is_refused(tmp_path: Path, position: int):
     path = save_checkpoint(tmp_path, 1, state(1.0))
     content = bytearray(path.read_bytes())
     content[position] ^= 1
@@ -50,7 +50,7 @@ def test_one_flipped_byte_is_refused(tmp_path: Path, position: int):
 
 
 @pytest.mark.parametrize("kept", [0, 10, 84, 1000])
-def test_truncated_is_refused(tmp_path: Path, kept: int):
+def test_a_truncated_checkpoint_is_refused(tmp_path: Path, kept: int):
     path = save_checkpoint(tmp_path, 1, state(1.0))
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(InputError, match=r"truncated|not a checkpoint"):
@@ -99,12 +99,12 @@ except InputError as problem:
 """
 
 
-def test_a_disk_that_fills_up_leaves_the_old_checkpoint(tmp_path: Path):
+def test_a_full_disk_leaves_the_old_checkpoint(tmp_path: Path):
     save_checkpoint(tmp_path, 1, state(1.0))
     command = [sys.executable, "-c", FULL_DISK, str(tmp_path)]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    assert "step-000000002.ckpt: cannot be written" in said
-    assert said.count("\n") == 1
+    message = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "step-000000002.ckpt: cannot be written" in message
+    assert message.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["step-000000001.ckpt"]
     assert load_checkpoint(latest_checkpoint(tmp_path), "d")["model"]["w"][0, 0] == 1
 
@@ -122,7 +122,7 @@ while True:
 """
 
 
-def test_killed_at_random_moments_a_checkpoint_loads(tmp_path: Path):
+def test_a_checkpoint_loads_after_a_kill_at_a_random_moment(tmp_path: Path):
     moments = random.Random(0)
     for _ in range(3):
         process = subprocess.Popen([sys.executable, "-c", SAVE_FOREVER, str(tmp_path)], stdout=subprocess.PIPE)
@@ -135,7 +135,7 @@ def test_killed_at_random_moments_a_checkpoint_loads(tmp_path: Path):
         assert load_checkpoint(latest_checkpoint(tmp_path), "d")["w"].shape == (1_000_000,)
 
 
-def test_atomic_writing_replaces_whole_files_only(tmp_path: Path):
+def test_write_atomically_replaces_the_whole_file(tmp_path: Path):
     path = tmp_path / "a.json"
     write_atomically(path, b"old")
     with pytest.raises(InputError, match="untouched"):

@@ -1,4 +1,4 @@
-"""The commands on good input: what they leave behind is what they promise."""
+"""The commands on good input: what they write and print."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from edge_se_sampler.commands import COMMANDS
 from edge_se_sampler.methods import STRATEGIES
 
 
-def test_a_run_folder(run: Path):
+def test_a_run_folder_has_config_metrics_checkpoint_and_previews(run: Path):
     names = {path.name.split(".tfevents")[0] for path in run.iterdir()}
     events = {"events.out"} if find_spec("tensorboard") else set()
     assert names == {"config.json", "metrics.jsonl", "checkpoints", "previews"} | events
@@ -87,6 +87,8 @@ def test_training_needs_no_held_out_views(scene: Path, tmp_path: Path, edge_se):
         (scene / f"transforms_{split}.json").unlink()
     assert edge_se("train", "se-nerf", "--data", scene, "--output-dir", tmp_path / "o", *SMALL).code == 0
     run = next(tmp_path.glob("o/*/*/*"))
+    spiral = ("render", run, "--output-path", tmp_path / "spiral.gif", "--num-frames", 2)
+    assert edge_se(*spiral).code == 0  # which needs the training cameras only
     answer = edge_se("eval", run, "--output-path", tmp_path / "e.json")
     assert answer.code == 2
     assert "transforms_test.json" in answer.err

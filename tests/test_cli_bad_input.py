@@ -170,7 +170,7 @@ def test_an_output_that_cannot_be_made_is_refused_early(command, flag: str, path
     (tmp_path / "file").write_text("in the way")
     line = refused(edge_se, tmp_path, *command, flag, tmp_path / path)
     assert flag in line
-    assert "cannot be made" in line
+    assert "cannot be created" in line
 
 
 def test_the_bench_inside_nerfstudio_needs_nerfstudio(tmp_path: Path, edge_se):

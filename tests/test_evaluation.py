@@ -33,7 +33,7 @@ def model_of(**changes: Any) -> NeRFModel:
 
 
 def empty_model(**changes: Any) -> NeRFModel:
-    """One that died: it shows nothing but its background."""
+    """A model without density: it renders its background alone."""
     return with_constant_density(model_of(**changes), -1)
 
 
@@ -53,14 +53,14 @@ def test_the_mean_over_images_is_not_the_pooled_psnr() -> None:
     assert result["psnr"] - result["psnr_pooled"] > 2  # or the two could be swapped unseen
 
 
-@pytest.mark.parametrize(("name", "shade"), [("white", 1.0), ("black", 0.0), ("random", 1.0)])
-def test_a_dead_model_has_the_backgrounds_psnr(name: Any, shade: float) -> None:
+@pytest.mark.parametrize(("name", "level"), [("white", 1.0), ("black", 0.0), ("random", 1.0)])
+def test_an_empty_model_has_the_psnr_of_the_background_alone(name: Any, level: float) -> None:
     views = tiny_views(2, HEIGHT, WIDTH)
     expected = []
     for image in views.images:
         pixels = image.astype(np.float64) / 255
-        shown = pixels[..., :3] * pixels[..., 3:] + shade * (1 - pixels[..., 3:])
-        expected.append(-10 * math.log10(((shown - shade) ** 2).mean()))
+        shown = pixels[..., :3] * pixels[..., 3:] + level * (1 - pixels[..., 3:])
+        expected.append(-10 * math.log10(((shown - level) ** 2).mean()))
     result = evaluate(empty_model(background_color=name), to_pictures(views))
     assert [row["psnr"] for row in result["images"]] == pytest.approx(expected, abs=1e-4)
 
@@ -77,7 +77,7 @@ def test_results_are_valid_json_even_of_a_perfect_match(channels: int) -> None:
     assert result["foreground_psnr"] == (None if channels == 3 else 100)
 
 
-def test_a_mean_is_over_the_views_that_have_the_measure() -> None:
+def test_a_mean_is_over_the_views_that_have_the_metric() -> None:
     """One of two views has no foreground: the other's is the mean."""
     seen = np.full((HEIGHT, WIDTH, 4), 255, dtype=np.uint8)
     seen[..., :3] = 102
@@ -106,7 +106,9 @@ def test_a_view_is_rendered_pixel_by_pixel_and_clipped() -> None:
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_chunks_leave_no_seam_and_the_mode_as_it_was(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_in_chunks_changes_neither_values_nor_the_models_mode(
+    training: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = model_of(density_noise=1.0, background_color="random").train(training)
     picture = to_pictures(tiny_views(1, 5, 7))[0]
     rays = picture.rays(torch.device("cpu"))
@@ -120,21 +122,21 @@ def test_chunks_leave_no_seam_and_the_mode_as_it_was(training: bool, monkeypatch
     assert model.training is training
 
 
-def test_every_view_is_handed_on_in_order() -> None:
+def test_the_callback_gets_every_view_in_order() -> None:
     views = tiny_views(3, 4, 5)
-    handed: list[tuple[int, str, np.ndarray]] = []
+    seen: list[tuple[int, str, np.ndarray]] = []
 
     def each(i: int, picture: Picture, image: np.ndarray) -> None:
-        handed.append((i, picture.name, image))
+        seen.append((i, picture.name, image))
 
     result = evaluate(empty_model(), to_pictures(views), each)
-    assert [(i, name) for i, name, _ in handed] == [(0, "view 0"), (1, "view 1"), (2, "view 2")]
-    assert all(image.shape == (4, 5, 3) and (image == 1).all() for _, _, image in handed)
+    assert [(i, name) for i, name, _ in seen] == [(0, "view 0"), (1, "view 1"), (2, "view 2")]
+    assert all(image.shape == (4, 5, 3) and (image == 1).all() for _, _, image in seen)
     assert len(result["images"]) == 3
 
 
-def test_colours_beyond_one_are_clipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rounding can leave a weight sum, and so a colour, a little above 1."""
+def test_colors_above_one_are_clipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding can leave a weight sum, and so a color, a little above 1."""
     model = empty_model()
 
     def too_bright(rays: Any) -> dict[str, Tensor]:
@@ -146,7 +148,7 @@ def test_colours_beyond_one_are_clipped(monkeypatch: pytest.MonkeyPatch) -> None
     assert decibel == 100
 
 
-def test_a_diverged_model_is_no_result() -> None:
+def test_a_diverged_model_raises_instead_of_returning_nan() -> None:
     """Clipping leaves nan as it is, and nan is not json."""
     model = empty_model()
     with torch.no_grad():

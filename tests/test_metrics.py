@@ -75,13 +75,13 @@ def test_an_image_smaller_than_the_window_has_no_ssim() -> None:
     assert compute_metrics(np.zeros((10, 10, 3)), np.zeros((10, 10, 3)), 1.0)["ssim"] is None
 
 
-def test_foreground_and_background_are_told_apart_by_alpha() -> None:
+def test_foreground_and_background_are_separated_by_alpha() -> None:
     """A gray square, one of whose pixels hardly covers anything; the rendering is off by 0.1 inside, 0.2 outside."""
     image = gray(0.5, 4)
     image[..., 3] = 0
     image[5:15, 4:12, 3] = 1
     image[5, 4, 3] = 1 / 255
-    image[0, 0, :3] = 0.123  # under alpha 0 a colour means nothing
+    image[0, 0, :3] = 0.123  # under alpha 0 the color is arbitrary
     inside = image[..., 3] > 0
     target = composite_on(image)
     np.testing.assert_allclose(target[~inside], 1)
@@ -95,7 +95,7 @@ def test_foreground_and_background_are_told_apart_by_alpha() -> None:
     assert result["mse"] == pytest.approx(share * 0.01 + (1 - share) * 0.04, rel=1e-5)
 
 
-def test_the_edge_band_is_the_strongest_tenth_and_its_neighbours() -> None:
+def test_the_edge_band_is_the_strongest_tenth_and_its_neighbors() -> None:
     """Black left of column 12, white from it on: Sobel answers in columns 11 and 12, the band is 10 to 13."""
     image = gray(0)
     image[:, 12:] = 1
@@ -106,7 +106,7 @@ def test_the_edge_band_is_the_strongest_tenth_and_its_neighbours() -> None:
         assert compute_metrics(rendered, image, 1.0)["edge_band_psnr"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_the_band_takes_the_strongest_tenth_only() -> None:
+def test_the_edge_band_leaves_weaker_edges_out() -> None:
     """Two edges, one of a tenth the contrast, that fill a fifth of the picture: only the strong one counts."""
     image = np.zeros((HEIGHT, 20, 3), dtype=np.float32)
     image[:, 5:] = 0.8
@@ -120,7 +120,7 @@ def test_the_band_takes_the_strongest_tenth_only() -> None:
     )
 
 
-def test_what_cannot_be_measured_is_none() -> None:
+def test_metrics_without_pixels_are_none() -> None:
     no_alpha = compute_metrics(gray(0.4), gray(0.5), 1.0)
     assert no_alpha["foreground_psnr"] is no_alpha["background_mse"] is None
     assert no_alpha["edge_band_psnr"] is None  # a flat picture has no edge

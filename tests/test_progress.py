@@ -11,7 +11,7 @@ from edge_se_sampler.engine.progress import Progress
 
 
 class Clock:
-    """Seconds that pass only when told to."""
+    """A clock that the test sets."""
 
     def __init__(self) -> None:
         self.now = 1000.0

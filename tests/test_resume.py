@@ -27,11 +27,11 @@ from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import lean
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
-what, place, data, interrupt_at, method = sys.argv[1:]
-place, data, interrupt_at = Path(place), Path(data), int(interrupt_at)
+command, folder, data, interrupt_at, method = sys.argv[1:]
+folder, data, interrupt_at = Path(folder), Path(data), int(interrupt_at)
 lean.UPDATE_INTERVAL, lean.ALPHA_THRESHOLD, lean.MIN_OPTICAL_DEPTH = 5, 0.001, 0.0
-if what == "resume":
-    run = RunFolder(place)
+if command == "resume":
+    run = RunFolder(folder)
     trainer = prepare_resume(run, run.config(method_configs()))
 else:
     config = method_configs()[method.split()[0]]
@@ -45,7 +45,7 @@ else:
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
     model = replace(config.pipeline.model, **samples)
     trainer = prepare(replace(
-        config, data=data, output_dir=place, max_num_iterations=20, steps_per_log=3, steps_per_eval_image=5,
+        config, data=data, output_dir=folder, max_num_iterations=20, steps_per_log=3, steps_per_eval_image=5,
         machine=MachineConfig(seed=3, device_type="cpu"),
         pipeline=replace(config.pipeline, datamanager=manager, model=model),
     ))
@@ -67,9 +67,11 @@ print(json.dumps({"run": str(trainer.run.path), "pixels": pixels}))
 """
 
 
-def session(what: str, place: Path, scene: Path, interrupt_at: int = -1, method: str = "edge-se-nerf") -> dict:
-    command = [sys.executable, "-c", SESSION, what, str(place), str(scene), str(interrupt_at), method]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+def session(command: str, folder: Path, scene: Path, interrupt_at: int = -1, method: str = "edge-se-nerf") -> dict:
+    arguments = [command, str(folder), str(scene), str(interrupt_at), method]
+    return json.loads(
+        subprocess.run([sys.executable, "-c", SESSION, *arguments], check=True, capture_output=True, text=True).stdout
+    )
 
 
 def metrics(run: Path) -> list[dict]:
@@ -110,7 +112,7 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, 
     run = Path(first["run"])
     assert [step for step, _ in first["pixels"]] == list(range(interrupt_at + 1))
     assert latest_checkpoint(run / "checkpoints").name == f"step-{interrupt_at:09d}.ckpt"
-    # what a kill may leave behind: metrics beyond the checkpoint, a line cut short
+    # what a killed process may leave: metrics of later steps, an unfinished line
     with open(run / "metrics.jsonl", "a") as file:
         file.write('{"step": 19, "loss": 1.0}\n{"step": 1')
     second = session("resume", run, scene)
@@ -120,7 +122,7 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, 
     assert any(isinstance(value, bytes) for value in state(run).values())
 
 
-def test_ctrl_c_saves_and_says_one_line(tmp_path: Path, scene: Path):
+def test_ctrl_c_saves_a_checkpoint_and_prints_one_line(tmp_path: Path, scene: Path):
     command = [
         sys.executable, "-m", "edge_se_sampler.cli", "train", "vanilla-nerf", "--data", str(scene),
         "--output-dir", str(tmp_path / "o"), "--pipeline.datamanager.train-num-rays-per-batch", "16",

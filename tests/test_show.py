@@ -1,4 +1,4 @@
-"""The picture of what a sampler does: its probabilities, and the file."""
+"""edge-se show: the probabilities that it draws, and the figure."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_the_png_has_a_row_for_each_view(tmp_path: Path) -> None:
 
 
 def red_dots(picture: np.ndarray) -> np.ndarray:
-    """(H, W) bool: the colour of drawn pixels, in the right third."""
+    """(H, W) bool: where the figure has the red of drawn pixels, in the right third."""
     red, green, blue = np.moveaxis(picture[..., :3].astype(int), -1, 0)
     dots = (red - green > 100) & (red - blue > 100)
     dots[:, : picture.shape[1] * 2 // 3] = False

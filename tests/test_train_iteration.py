@@ -38,11 +38,11 @@ def gradients(trainer: Trainer) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("rays_a_chunk", [1, 10, 36])
-def test_gradients_gathered_chunk_by_chunk_are_those_of_the_whole(
+def test_gradients_accumulated_in_chunks_equal_those_of_one_batch(
     rays_a_chunk: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """37 rays, so that the last chunk is a smaller one. The random numbers along the rays are held, because a
-    chunk draws its own."""
+    """37 rays, so that the last chunk is smaller. The random numbers along the rays are fixed, because every chunk
+    draws its own."""
     points = 2 * 6 + 5
     found = []
     for chunk in (rays_a_chunk, 1000):
@@ -88,7 +88,7 @@ def test_the_loss_is_the_mean_over_rays_and_weights() -> None:
     assert loss == pytest.approx(float((error * batch["weight"]).mean()), rel=1e-5)
 
 
-def test_gradients_of_an_earlier_step_are_forgotten() -> None:
+def test_gradients_of_an_earlier_step_are_cleared() -> None:
     once, twice = trainer_of("vanilla-nerf"), trainer_of("vanilla-nerf")
     before = {key: value.clone() for key, value in twice.pipeline.model.state_dict().items()}
     twice.train_iteration(0)
@@ -138,7 +138,7 @@ def test_training_lowers_the_loss() -> None:
     assert sum(losses[-10:]) < 0.92 * sum(losses[:10])
 
 
-def test_a_loss_that_is_not_finite_stops_the_training_before_the_weights_are_spoilt() -> None:
+def test_a_loss_that_is_not_finite_raises_before_the_weights_change() -> None:
     trainer = trainer_of("vanilla-nerf")
     model = trainer.pipeline.model
     with torch.no_grad():
@@ -150,7 +150,7 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_the_weights_are_spo
 
 
 @pytest.mark.parametrize("supported", [True, False])
-def test_a_fused_step_where_torch_has_one(supported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fused_adam_where_torch_supports_it(supported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     adam = torch.optim.Adam
 
     def old(*arguments: Any, **settings: Any) -> torch.optim.Adam:

@@ -1,4 +1,4 @@
-"""Videos: as many frames as there are, and refusals before anything is rendered."""
+"""Videos: their frames, and what is refused before anything is rendered."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def test_an_mp4_has_every_frame(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["turn.mp4"]
 
 
-def test_mp4_without_its_extra_is_refused_by_the_extras_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_video_extra_an_mp4_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(InputError, match=r"edge-se-sampler\[video\]"):
         check_video(tmp_path / "turn.mp4", 20)
     check_video(tmp_path / "turn.GIF", 20)  # which needs none
 
 
-def test_a_gifs_frames_stand_for_the_nearest_hundredth_of_a_second(tmp_path: Path) -> None:
+def test_a_gif_rounds_the_duration_of_frames_to_hundredths_of_a_second(tmp_path: Path) -> None:
     for rate, milliseconds in ((30, 30), (45, 20), (24, 40), (15, 70)):
         write_video(tmp_path / "turn.gif", FRAMES, rate)
         assert iio.immeta(tmp_path / "turn.gif")["duration"] == milliseconds

@@ -80,7 +80,7 @@ def make_folder(path: Path, flag: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
         writable = os.access(path, os.W_OK)
     except OSError as problem:
-        raise InputError(f"{flag} {path}: cannot be made ({problem.strerror or problem})") from problem
+        raise InputError(f"{flag} {path}: cannot be created ({problem.strerror or problem})") from problem
     if not writable:
         raise InputError(f"{flag} {path}: cannot be written")
 

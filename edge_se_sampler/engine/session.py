@@ -28,17 +28,17 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 def prepare(config: TrainerConfig) -> Trainer:
-    """Read the data, decide what the config leaves open, and open a new run folder.
+    """Read the data, resolve the config, and create a run folder and its trainer.
 
     Raises:
-        InputError: bad data or settings; nothing has been written then.
+        InputError: bad data or settings; nothing is written then.
     """
     views, preview = _read(config)
     device = choose_device(config.machine.device_type)
-    plan = resolve_config(config, views)
+    config = resolve_config(config, views)
     disable_malloc_trimming()
-    pipeline = Pipeline.build(plan, views, device)
-    return plan.setup(run=RunFolder.create(plan), pipeline=pipeline, preview=preview)
+    pipeline = Pipeline.build(config, views, device)
+    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=preview)
 
 
 def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
@@ -156,7 +156,7 @@ def describe_run(trainer: Trainer) -> str:
 def _samples(model: ModelConfig) -> str:
     if isinstance(model, NeRFModelConfig):
         return f"{model.num_coarse_samples} + {model.num_importance_samples} samples a ray"
-    return "samples where the scene is"
+    return "samples in occupied cells"
 
 
 def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
