@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -94,18 +95,27 @@ def test_peak_memory_is_the_trainings_alone(data: Path) -> None:
     assert run["peak_bytes"] > 2**22
 
 
+@pytest.fixture
+def ticks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that every look at it moves on by 10 ms: a step takes 10 ms."""
+    count = itertools.count()
+    monkeypatch.setattr(ChartSettings, "clock", lambda _: 0.01 * next(count))
+
+
 @pytest.mark.parametrize("guess", [10, 100_000])
+@pytest.mark.usefixtures("ticks")
 def test_a_plan_that_misses_its_time_is_made_again(guess: int, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "iterations_within", lambda config, settings: guess)
     run = train_and_evaluate(Trial("lean", "mic", 1), ChartSettings(seconds=1.5), data)
-    assert 20 < run["planned_steps"] < 10_000
-    assert 0.5 < run["steps"] / run["planned_steps"] <= 1
+    assert run["planned_steps"] == pytest.approx(149, abs=2)
+    assert run["steps"] == run["planned_steps"]
+    assert run["seconds"] == pytest.approx(1.5, abs=0.02)
 
 
-def test_more_time_allows_more_iterations(data: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("ticks")
+def test_a_plan_has_as_many_iterations_as_fit(data: Path, tmp_path: Path) -> None:
     config = config_of(Trial("lean", "mic", 0), data, tmp_path)
-    short, long = (iterations_within(config, ChartSettings(seconds)) for seconds in (2, 20))
-    assert 3 * short < long
+    assert [iterations_within(config, ChartSettings(seconds)) for seconds in (2, 4)] == [199, 399]
 
 
 # -- what the runs say
