@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench.report import report_of
+from edge_se_sampler.bench.chart.report import tables
+from edge_se_sampler.bench.report import fill_template, report_of
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 FOLDERS = sorted(path.parent for path in CONFIGS.rglob("README.md"))
@@ -21,7 +22,7 @@ def test_a_committed_readme_is_generated_from_its_results(folder: Path) -> None:
 
 def test_the_tables_of_the_main_readme_are_generated() -> None:
     readme = (CONFIGS.parent / "README.md").read_text()
-    for name, table in report_of(CONFIGS / "chart").tables(CONFIGS / "chart").items():
+    for name, table in tables(CONFIGS / "chart").items():
         assert f"<!-- table: {name} -->\n{table}\n<!-- end -->" in readme
 
 
@@ -62,3 +63,15 @@ def test_folders_without_results_and_texts_without_markers_are_refused(
         answer = edge_se("bench", "report", *options)
         assert answer.code == 2, answer
         assert message in answer.err
+
+
+def test_a_template_is_filled_without_the_sections_and_pictures_that_are_missing(tmp_path: Path) -> None:
+    (tmp_path / "there.png").touch()
+    (tmp_path / "report.md").write_text(
+        "# Title\n\n{note}\n\n![a](there.png)\n*caption*\n\n![b](missing.png)\n*caption*\n\n"
+        "## Nothing to say\n\n{empty} of {absent:.1f}.\n\n## Sizes\n\n{size:.1f} m\n\n## Plain\n\nText.\n"
+    )
+    filled = fill_template(str(tmp_path / "report.py"), tmp_path, note="", size=2)
+    assert filled == "# Title\n\n![a](there.png)\n*caption*\n\n## Sizes\n\n2.0 m\n\n## Plain\n\nText.\n"
+    with pytest.raises(KeyError, match="absent"):  # a section with some of its values is a mistake
+        fill_template(str(tmp_path / "report.py"), tmp_path, note="", empty="x", size=2)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib import import_module
 from pathlib import Path
+from string import Formatter
 from typing import Any, Protocol
 
 from edge_se_sampler.bench.tables import fill_markers
@@ -24,7 +26,7 @@ REPORTS = {
 
 
 class Report(Protocol):
-    """What such a module has."""
+    """What such a module has; and `tables(folder)`, tables by name, if other texts show some between markers."""
 
     def describe(self, folder: Path) -> str:
         """The README.md of a folder of results; a function of the json files and of which pictures there are."""
@@ -32,10 +34,6 @@ class Report(Protocol):
 
     def draw(self, folder: Path, workplace: Path | None) -> None:
         """Draw the folder's pictures; those that need renderings only where the workplace has them."""
-        ...
-
-    def tables(self, folder: Path) -> dict[str, str]:
-        """Tables by name that other texts show between markers."""
         ...
 
 
@@ -67,7 +65,30 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
     report.draw(folder, workplace)
     write_atomically(folder / "README.md", report.describe(folder).encode())
     if readme is not None:
-        fill_markers(readme, report.tables(folder))
+        tables = getattr(report, "tables", None)
+        fill_markers(readme, tables(folder) if tables else {})
+
+
+def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:
+    """The report.md beside a module, its {placeholders} filled in by `str.format`.
+
+    Left out are sections, from a `##` heading to the next, that have placeholders of which none has a value, and
+    paragraphs that begin with a picture, `![...](NAME.png)`, which does not lie in the folder.
+    """
+    template = Path(module_file).with_name("report.md").read_text(encoding="utf-8")
+    first, *others = re.split(r"(?m)^(?=##+ )", template)
+    text = "".join(section.format(**parts) for section in [first, *(s for s in others if not _is_empty(s, parts))])
+    paragraphs = [
+        paragraph
+        for paragraph in re.split(r"\n{2,}", text.strip())
+        if all((folder / picture).exists() for picture in re.findall(r"\A!\[.*?\]\((.*?)\)", paragraph))
+    ]
+    return "\n\n".join(paragraphs) + "\n"
+
+
+def _is_empty(section: str, parts: dict[str, object]) -> bool:
+    names = [name for _, name, _, _ in Formatter().parse(section) if name]
+    return bool(names) and all(parts.get(name, "") == "" for name in names)
 
 
 def _experiment_of(path: Path) -> str | None:

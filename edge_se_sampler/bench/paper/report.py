@@ -103,11 +103,6 @@ def describe(folder: Path) -> str:
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
-def tables(folder: Path) -> dict[str, str]:
-    """None: no other text shows them."""
-    return {}
-
-
 def _describe_settings(result: dict[str, Any]) -> str:
     settings, runs = result["settings"], result["runs"]
     samples = " + ".join(map(str, settings["samples"])) if settings["samples"] else "the paper's number of"

@@ -75,11 +75,6 @@ def describe(folder: Path) -> str:
     return "\n\n".join([*parts, "## Reproduce", describe_command(result)]) + "\n"
 
 
-def tables(folder: Path) -> dict[str, str]:
-    """None: no other text shows them."""
-    return {}
-
-
 def pair_failures(runs: list[Run]) -> dict[tuple[int, str, int], tuple[bool, bool]]:
     """(table, scene, seed) -> whether Random failed and whether the adaptive schedule did, where both were trained."""
     outcomes = {
