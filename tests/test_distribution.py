@@ -122,7 +122,7 @@ def test_every_drawable_image_alike_whatever_its_size_or_sum() -> None:
     assert fits_images(drawn)
 
 
-def test_the_first_column_is_the_position_among_the_images_asked_for() -> None:
+def test_the_first_column_is_the_position_among_the_requested_images() -> None:
     table = table_of(*IMAGES)
     chosen = torch.tensor([5, 3, 0, 2])  # any order, any subset
     drawn = table.draw(chosen, 600_000, np.random.default_rng(1))
@@ -314,7 +314,7 @@ def test_probability_is_strength_over_sum(shape: tuple[int, int]) -> None:
     np.testing.assert_allclose(p, strength / strength.sum(dtype=np.float64), rtol=0, atol=QUANTUM)
 
 
-def test_relative_is_probability_times_drawable_pixels() -> None:
+def test_density_ratio_is_probability_times_drawable_pixels() -> None:
     table = table_of(*IMAGES)
     chosen = torch.tensor([5, 2, 0, 3])
     drawn = table.draw(chosen, 500, np.random.default_rng(0))
@@ -323,7 +323,7 @@ def test_relative_is_probability_times_drawable_pixels() -> None:
     np.testing.assert_allclose(table.density_ratio(chosen, drawn).numpy(), expected, rtol=1e-12)
 
 
-def test_relative_of_pixels_that_cannot_be_drawn_is_zero() -> None:
+def test_density_ratio_of_pixels_that_cannot_be_drawn_is_zero() -> None:
     table = table_of(*IMAGES)
     assert (
         table.density_ratio(torch.tensor([1, 5, 4]), torch.tensor([[0, 0, 0], [1, 0, 0], [2, 49, 49]])).tolist()

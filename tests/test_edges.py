@@ -186,7 +186,7 @@ def test_white_on_white_has_only_alpha_edges(
     np.testing.assert_array_equal(edges["both"], np.maximum(edges["color"], edges["alpha"]))
 
 
-def test_white_is_the_background_unless_told() -> None:
+def test_the_default_background_is_white() -> None:
     image = random_image((6, 6), 4)
     on_white = edge_strength(image, background=(1.0, 1.0, 1.0))
     np.testing.assert_array_equal(edge_strength(image), on_white)

@@ -80,6 +80,10 @@ def test_no_module_imports_itself_through_others() -> None:
     assert circle(imports(ROOT)) == []
 
 
+def test_imports_follow_the_order_of_the_layers() -> None:
+    assert upward(imports(ROOT)) == []
+
+
 @pytest.mark.parametrize(
     "statement",
     [

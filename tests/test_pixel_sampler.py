@@ -88,7 +88,7 @@ def test_the_number_of_rays_can_change(phase: dict) -> None:
         assert len(sampler.sample(batch_of())["indices"]) == rays
 
 
-def test_whole_images_come_along_when_asked_for(phase: dict) -> None:
+def test_keep_full_image_returns_whole_images(phase: dict) -> None:
     host = batch_of()
     assert following(**phase, keep_full_image=True).sample(host)["full_image"] is host["image"]
     assert "full_image" not in following(**phase).sample(host)

@@ -28,7 +28,7 @@ class ForeignConfig(PixelSamplerConfig):
     _target: ClassVar[type | str] = Foreign
 
 
-def test_setup_builds_the_target_from_the_config_and_what_it_is_given() -> None:
+def test_setup_builds_the_target_from_the_config_and_the_arguments() -> None:
     config = ForeignConfig(num_rays_per_batch=9)
     sampler = config.setup(fisheye_crop_radius=None, is_equirectangular=False)
     assert type(sampler) is Foreign
@@ -37,7 +37,7 @@ def test_setup_builds_the_target_from_the_config_and_what_it_is_given() -> None:
     assert sampler.num_rays_per_batch == 9
 
 
-def test_setup_imports_a_target_that_is_named() -> None:
+def test_setup_imports_a_target_given_as_a_string() -> None:
     assert EdgeSEPixelSamplerConfig._target == "edge_se_sampler.sampling.pixel_sampler:EdgeSEPixelSampler"
     assert type(EdgeSEPixelSamplerConfig().setup()) is EdgeSEPixelSampler
 
@@ -59,15 +59,15 @@ def test_the_hosts_arguments_override_the_config(config: PixelSamplerConfig) -> 
     assert sampler.num_rays_per_batch == 4
 
 
-def test_a_sampler_must_say_how_it_samples() -> None:
+def test_sample_is_abstract() -> None:
     with pytest.raises(TypeError, match="sample"):
         PixelSampler(PixelSamplerConfig())  # pyright: ignore[reportAbstractUsage]
 
 
-@pytest.mark.parametrize("places", [[], list(TrainingCallbackLocation)[:1], list(TrainingCallbackLocation)])
-def test_a_callback_runs_at_its_places_only(places: list[TrainingCallbackLocation]) -> None:
+@pytest.mark.parametrize("locations", [[], list(TrainingCallbackLocation)[:1], list(TrainingCallbackLocation)])
+def test_a_callback_runs_at_its_locations_only(locations: list[TrainingCallbackLocation]) -> None:
     ran: list[tuple[int, TrainingCallbackLocation]] = []
     for at in TrainingCallbackLocation:
-        callback = TrainingCallback(places, lambda step, at=at: ran.append((step, at)))
+        callback = TrainingCallback(locations, lambda step, at=at: ran.append((step, at)))
         callback.run_callback_at_location(7, at)
-    assert ran == [(7, at) for at in places]
+    assert ran == [(7, at) for at in locations]

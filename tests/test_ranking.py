@@ -31,7 +31,7 @@ WRONG: dict[str, Ranking] = {
 }
 
 
-def test_the_literal_argsort_is_another_thing_than_the_rank() -> None:
+def test_the_rank_differs_from_the_literal_argsort() -> None:
     errors = np.array([0.3, 0.1, 0.9, 0.2])
     assert error_ranks(errors, np.random.default_rng(0)).tolist() == [3, 1, 4, 2]
     assert literal_argsort(errors, np.random.default_rng(0)).tolist() == [2, 4, 1, 3]
@@ -145,7 +145,7 @@ def test_exactly_n_different_rows_in_order(count: int, keep: int) -> None:
     assert torch.equal(errors, before)
 
 
-def test_whoever_keeps_all_keeps_each_for_certain() -> None:
+def test_keeping_all_has_inclusion_probability_one() -> None:
     kept = sample_by_rank(torch.rand(50), 50, np.random.default_rng(0))
     assert kept.rows.tolist() == list(range(50))
     assert kept.inclusion.tolist() == [1.0] * 50

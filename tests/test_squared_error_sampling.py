@@ -14,15 +14,15 @@ from torch import Tensor
 
 
 class Model:
-    """Scores candidates as a function of their pixel, and remembers what it was asked."""
+    """Scores candidates as a function of their pixel, and records the calls."""
 
     def __init__(self) -> None:
-        self.asked: list[dict[str, Any]] = []
+        self.calls: list[dict[str, Any]] = []
         self.grad: list[bool] = []
         self.weight = torch.ones((), requires_grad=True)
 
     def __call__(self, candidates: dict[str, Any]) -> Tensor:
-        self.asked.append(candidates)
+        self.calls.append(candidates)
         self.grad.append(torch.is_grad_enabled())
         return self.weight * brightness(candidates)
 
@@ -34,8 +34,8 @@ def test_n_of_the_candidates_without_replacement(candidates: int, masked: bool, 
     model = Model()
     host = batch_of(sizes, masks=half_masks(sizes) if masked else None)
     pixels = following(LATE, rays=50, se_candidates=candidates, squared_error=model).sample(host)
-    assert len(model.asked) == 1
-    offered = model.asked[0]
+    assert len(model.calls) == 1
+    offered = model.calls[0]
     assert set(offered) == set(pixels)
     assert all(len(value) == candidates * 50 for value in offered.values())
     assert torch.equal(offered["address"], offered["indices"])
@@ -53,17 +53,17 @@ def test_candidates_are_scored_without_gradients() -> None:
     assert model.grad == [False]
 
 
-def test_the_model_is_not_asked_before_the_late_phase() -> None:
+def test_the_model_scores_nothing_before_the_late_phase() -> None:
     model = Model()
     for early in ("uniform", "precrop", "edge"):
         following(0, early=early, squared_error=model).sample(batch_of())
-    assert model.asked == []
+    assert model.calls == []
 
 
 def test_candidates_are_uniform() -> None:
     model = Model()
     following(LATE, rays=20_000, images_per_step="all", squared_error=model).sample(batch_of())
-    indices = model.asked[0]["indices"]
+    indices = model.calls[0]["indices"]
     order = torch.tensor([NUMBERS.index(number) for number in indices[:, 0].tolist()])
     counts = pixel_counts(torch.cat((order[:, None], indices[:, 1:]), dim=1), (3, 9, 14))
     assert p_value(counts, np.full(counts.shape, 1 / counts.size)) > ALPHA

@@ -18,7 +18,7 @@ def host_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip("needs all of nerfstudio 1.1.5")
     from full_host import without_lpips_downloads
 
-    # nerfstudio's checkpoints of scheduled methods hold numpy scalars, which torch >= 2.6 loads only when told so
+    # nerfstudio's checkpoints of scheduled methods hold numpy scalars, which torch >= 2.6 refuses without this
     os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
     os.environ["TORCH_HOME"] = str(tmp_path_factory.mktemp("torch"))
     without_lpips_downloads()

@@ -33,12 +33,12 @@ SIZES = [(32, 32), (20, 30), (31, 17), (32, 24), (9, 32), (25, 25)]
 
 def nerfstudio_folder(folder: Path, source: Path, *, mixed: bool, masked: bool, channels: int) -> Path:
     """Six views in nerfstudio's own format; mixed: each cropped to another size; masked: to its left half."""
-    told = json.loads((source / "transforms_train.json").read_text())
+    transforms = json.loads((source / "transforms_train.json").read_text())
     frames = []
     for i, (height, width) in enumerate(SIZES):
-        frame = told["frames"][i % len(told["frames"])]
+        frame = transforms["frames"][i % len(transforms["frames"])]
         image = iio.imread(source / f"{frame['file_path']}.png")[..., :channels]
-        focal = 0.5 * image.shape[1] / np.tan(0.5 * told["camera_angle_x"])
+        focal = 0.5 * image.shape[1] / np.tan(0.5 * transforms["camera_angle_x"])
         height, width = (height, width) if mixed else image.shape[:2]
         iio.imwrite(folder / f"{i}.png", image[:height, :width])
         frames.append(
@@ -189,7 +189,7 @@ def test_a_parallel_data_manager_is_refused(host_scene: Path, tmp_path: Path) ->
         config.pipeline.datamanager.setup(device="cpu")
 
 
-def test_a_data_manager_that_does_not_bind_it_is_told(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
+def test_a_sampler_that_is_never_bound_warns_once(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
     config = config_of("vanilla-nerf", host_scene, tmp_path)
     assert type(config.pipeline.datamanager) is VanillaDataManagerConfig
     config.pipeline.datamanager.pixel_sampler = EdgeSEPixelSamplerConfig()

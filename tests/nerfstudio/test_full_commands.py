@@ -60,9 +60,9 @@ def test_train_resume_and_evaluate(method: str, trained: dict[str, Path], host_s
     assert [path.name for path in (again / "nerfstudio_models").iterdir()] == ["step-000000022.ckpt"]
     assert json.loads((again / "edge-se-plan.json").read_text()) == {"planned_steps": 20}
     ns("eval", "--load-config", again / "config.yml", "--output-path", tmp_path / "eval.json")
-    told = json.loads((tmp_path / "eval.json").read_text())
-    assert told["method_name"] == method
-    assert math.isfinite(told["results"]["psnr"])
+    evaluation = json.loads((tmp_path / "eval.json").read_text())
+    assert evaluation["method_name"] == method
+    assert math.isfinite(evaluation["results"]["psnr"])
 
 
 def test_render(trained: dict[str, Path], tmp_path: Path) -> None:
@@ -91,13 +91,13 @@ def test_the_viewer(host_scene: Path, tmp_path: Path) -> None:
 
 
 def test_help_names_the_methods_and_their_flags() -> None:
-    def told(*arguments: str) -> str:
+    def help_of(*arguments: str) -> str:
         return " ".join(ns("train", *arguments, "--help").replace("│", " ").split())
 
-    methods = told()
+    methods = help_of()
     for method in ("edge-nerf", "edge-se-nerf", "se-nerf", "precrop-nerf", "precrop-se-nerf", "edge-se-nerfacto"):
         assert method in methods
     assert "by edge strength first, then by squared error" in methods
-    flags = told("edge-se-nerf")
+    flags = help_of("edge-se-nerf")
     assert "--pipeline.datamanager.pixel-sampler.early {uniform,precrop,edge,auto}" in flags
     assert "--pipeline.datamanager.pixel-sampler.late {uniform,se}" in flags

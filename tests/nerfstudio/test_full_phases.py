@@ -79,11 +79,11 @@ def test_a_resumed_run_draws_what_the_uninterrupted_one_draws(host_scene: Path, 
     config.timestamp = "first"
     first = trainer_of(copy.deepcopy(config))
     drawn(first, 5)
-    for ours, theirs in zip(drawn(resumed(config, first), 3), expected[5:], strict=True):
-        assert torch.equal(ours, theirs)
+    for pixels, expected_pixels in zip(drawn(resumed(config, first), 3), expected[5:], strict=True):
+        assert torch.equal(pixels, expected_pixels)
 
 
-def test_a_checkpoint_without_a_plan_is_told(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
+def test_a_checkpoint_without_a_plan_is_reported(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
     config = config_of("edge-se-nerf", host_scene, tmp_path)
     trainer = trainer_of(config)
     train(trainer, 1)

@@ -84,8 +84,8 @@ def test_the_union_over_ranks_is_one_draw(host_scene: Path, tmp_path: Path) -> N
     for step in (0, 1):
         union = torch.stack((first["indices"][step], second["indices"][step]), dim=1).reshape(-1, 3)
         assert torch.equal(union, alone["indices"][step])
-    for mine, other, all_of_them in zip(first["candidates"], second["candidates"], alone["candidates"], strict=True):
-        assert torch.equal(torch.stack((mine, other), dim=1).reshape(-1, 3), all_of_them)
+    for part_0, part_1, whole in zip(first["candidates"], second["candidates"], alone["candidates"], strict=True):
+        assert torch.equal(torch.stack((part_0, part_1), dim=1).reshape(-1, 3), whole)
     assert torch.equal(first["weights"], second["weights"])
     plans = sorted(tmp_path.glob("runs-*/**/edge-se-plan.json"))
     assert [plan.relative_to(tmp_path).parts[0] for plan in plans] == ["runs-0"]  # the first rank writes it

@@ -146,15 +146,15 @@ def test_the_same_pixels_are_drawn_as_on_our_own_base(kind: str, strategy: str, 
     batch = BATCHES[kind]()
     settings = STRATEGY_SETTINGS[strategy] | {"images_per_step": images_per_step}
     ours = bound(settings_module.EdgeSEPixelSamplerConfig(**settings))
-    theirs = of_host(strategy, images_per_step=images_per_step)
-    assert type(ours).__mro__[1] is type(theirs).__mro__[1] is ImportantPixels
+    hosted = of_host(strategy, images_per_step=images_per_step)
+    assert type(ours).__mro__[1] is type(hosted).__mro__[1] is ImportantPixels
     assert not isinstance(ours, PixelSampler)
     drawn = []
     for step in (3, 4):
         ours.set_step(step)
-        theirs.set_step(step)
-        assert theirs.strategy == ours.strategy == strategy
-        expected, pixels = ours.sample(batch), theirs.sample(batch)
+        hosted.set_step(step)
+        assert hosted.strategy == ours.strategy == strategy
+        expected, pixels = ours.sample(batch), hosted.sample(batch)
         assert expected.keys() == pixels.keys()
         assert all(torch.equal(expected[key], pixels[key]) for key in expected)
         check_pixels(batch, pixels)
@@ -278,7 +278,7 @@ def test_configs_are_importable_by_name_and_survive_pickling() -> None:
     assert isinstance(again.setup(num_rays_per_batch=4), EdgeSEPixelSampler)
 
 
-def test_the_flags_are_ours_and_theirs() -> None:
+def test_the_flags_are_those_of_both_configs() -> None:
     kind = tyro.conf.SuppressFixed[EdgeSEPixelSamplerConfig]  # as ns-train does
     config = tyro.cli(kind, args=["--early", "precrop", "--max-num-iterations", "7"])
     assert config == EdgeSEPixelSamplerConfig(early="precrop", max_num_iterations=7)
@@ -296,8 +296,8 @@ def test_all_images_a_step_is_the_default_here() -> None:
     ("kwargs", "message"),
     [
         ({"is_equirectangular": torch.tensor(True)}, "equirectangular"),
-        ({"fisheye_crop_radius": 4.0}, "fisheye_crop_radius"),
-        ({"fisheye_crop_radius": torch.tensor(4.0)}, "fisheye_crop_radius"),
+        ({"fisheye_crop_radius": 4.0}, "fisheye crop radius"),
+        ({"fisheye_crop_radius": torch.tensor(4.0)}, "fisheye crop radius"),
     ],
 )
 def test_cameras_whose_pixels_are_not_alike_are_refused(strategy: str, kwargs: Any, message: str) -> None:
@@ -402,15 +402,15 @@ def test_their_sampler_keeps_to_the_masks_of_our_data_manager() -> None:
 
 
 def test_training_is_the_same_with_our_sampler_on_either_base(scene: Path) -> None:
-    """Bound, told the step and asked for errors by the same data manager: both phases, to the last bit."""
+    """Bound to a run by the same data manager: both phases, to the last bit."""
     views = read_blender(scene, "train")
     ours = trainer_with(settings_module.EdgeSEPixelSamplerConfig(early_fraction=0.2, images_per_step="all"), views)
-    theirs = trainer_with(EdgeSEPixelSamplerConfig(early_fraction=0.2), views)
-    assert isinstance(theirs.pipeline.datamanager.train_pixel_sampler, PixelSampler)
+    hosted = trainer_with(EdgeSEPixelSamplerConfig(early_fraction=0.2), views)
+    assert isinstance(hosted.pipeline.datamanager.train_pixel_sampler, PixelSampler)
     strategies = []
     for step in range(4):
-        assert ours.train_iteration(step) == theirs.train_iteration(step)
-        strategies.append(theirs.pipeline.datamanager.train_pixel_sampler.strategy)
+        assert ours.train_iteration(step) == hosted.train_iteration(step)
+        strategies.append(hosted.pipeline.datamanager.train_pixel_sampler.strategy)
     assert strategies == ["edge", "edge", "se", "se"]
 
 
