@@ -29,6 +29,7 @@ from edge_se_sampler.bench.stability.train import (
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.models.nerf import NeRFModel
+from edge_se_sampler.sampling.distribution import PixelTable
 from edge_se_sampler.sampling.edges import edge_strength
 
 SMALL = TrainingSize(iterations=4, rays=8, width=8, samples=4)
@@ -191,8 +192,10 @@ def test_edges_are_those_in_front_of_the_settings_background(background: Any, tm
     trainer, _ = build_trainer(Setting(background=background), "edge-nerf", 3, SMALL, tmp_path)
     manager = trainer.pipeline.datamanager
     edges = edge_strength(manager.image_batch["image"][0].numpy(), background=COLORS[background]) + np.float32(0.01)
-    tables = manager.train_pixel_sampler._tables["edge"]
-    probability = tables.table.probability(tables.place[0]).numpy()
+    sampler = manager.train_pixel_sampler
+    table, table_index = sampler.strategies["edge"].distribution.tables(sampler._read(manager.image_batch))
+    assert isinstance(table, PixelTable)
+    probability = table.probability(int(table_index[0])).numpy()
     np.testing.assert_allclose(probability, edges / edges.sum(), rtol=1e-3, atol=1e-9)
 
 
