@@ -44,7 +44,7 @@ def test_a_corner_is_stored_once_and_only_corners_of_cells() -> None:
     assert len(FeatureGrid(grid(apart), 3).table) == 16
 
 
-def test_what_is_linear_is_exact_in_between() -> None:
+def test_interpolation_of_a_linear_function_is_exact() -> None:
     shown = some_cells()
     cells = grid(shown)
     features = FeatureGrid(cells, 4).double()
@@ -82,12 +82,12 @@ def test_features_do_not_jump_between_cells() -> None:
     torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
 
 
-def test_features_begin_at_nothing() -> None:
+def test_features_are_0_at_first() -> None:
     shown = some_cells()
     assert not bool(features_at(FeatureGrid(grid(shown), 4).double(), inside(shown)).any())
 
 
-# -- cells that are split
+# -- refined cells
 
 
 def random_features(cells: OccupancyGrid) -> FeatureGrid:
@@ -97,8 +97,8 @@ def random_features(cells: OccupancyGrid) -> FeatureGrid:
     return features
 
 
-def split_some(shown: np.ndarray, max_level: int = 1) -> tuple[FeatureGrid, torch.Tensor]:
-    """Cells of which about half are split so often, and which of today's were."""
+def refine_some(shown: np.ndarray, max_level: int = 1) -> tuple[FeatureGrid, torch.Tensor]:
+    """A grid subdivided to a level, about half of its cells refined, and which these are."""
     cells = OccupancyGrid.from_hull(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown), max_level).double()
     features = random_features(cells)
     refined = cells.static_mask & (
@@ -111,9 +111,9 @@ def split_some(shown: np.ndarray, max_level: int = 1) -> tuple[FeatureGrid, torc
 
 
 @pytest.mark.parametrize("max_level", [1, 2])
-def test_a_split_changes_no_feature(max_level: int) -> None:
+def test_refining_changes_no_feature(max_level: int) -> None:
     shown, points = some_cells(), inside(some_cells())
-    features, refined = split_some(shown, max_level)
+    features, refined = refine_some(shown, max_level)
     before = random_features(grid(shown))
     (cells,) = features.grid
     assert float(cells.cell_size) == SIDE / 2**max_level
@@ -121,8 +121,8 @@ def test_a_split_changes_no_feature(max_level: int) -> None:
     torch.testing.assert_close(features_at(features, points), features_at(before, points))
 
 
-def test_split_cells_have_corners_of_their_own_and_others_the_first_ones() -> None:
-    features, refined = split_some(some_cells())
+def test_refined_cells_have_corners_of_their_own_and_others_the_coarse_ones() -> None:
+    features, refined = refine_some(some_cells())
     before, points = random_features(grid(some_cells())), inside(some_cells())
     (cells,) = features.grid
     inner = refined.reshape(-1)[cells.locate(points)]
@@ -137,10 +137,10 @@ def test_split_cells_have_corners_of_their_own_and_others_the_first_ones() -> No
     torch.testing.assert_close(after[~inner], torch.full_like(after[~inner], 2))
 
 
-def test_corners_of_split_cells_are_stored_once() -> None:
+def test_corners_of_refined_cells_are_stored_once() -> None:
     one = np.zeros((3, 1, 1), dtype=bool)
     one[1] = True
-    features, _ = split_some(one, 0)
+    features, _ = refine_some(one, 0)
     (cells,) = features.grid
     assert len(features.table) == 8
     cells.max_level.fill_(1)
@@ -148,8 +148,8 @@ def test_corners_of_split_cells_are_stored_once() -> None:
     assert len(features.table) == 8 + 27
 
 
-def test_cells_that_join_later_begin_with_what_is_known_there() -> None:
-    features, refined = split_some(some_cells())
+def test_cells_refined_later_begin_with_the_features_there() -> None:
+    features, refined = refine_some(some_cells())
     with torch.no_grad():  # the levels have gone apart
         features.table.normal_(generator=torch.Generator().manual_seed(2))
     (cells,) = features.grid

@@ -83,7 +83,7 @@ def test_a_point_is_evaluated_as_the_figure_says(depth: int) -> None:
     np.testing.assert_allclose(color.detach(), expected[:, 1:], rtol=0, atol=1e-12)
 
 
-def test_the_position_joins_again_after_the_fifth_layer() -> None:
+def test_the_skip_connection_is_after_the_fifth_layer() -> None:
     """A layer that is cut loses the position for good, unless the skip comes later."""
     positions, directions = points(50, 1)
     sees_position = []
@@ -122,7 +122,7 @@ def test_samples_in_rows_are_those_of_their_rays() -> None:
     assert not torch.allclose(dense[1], wrong[1])
 
 
-def test_a_part_of_the_points_gives_that_part_of_the_answer() -> None:
+def test_a_subset_of_the_points_gives_that_subset_of_the_result() -> None:
     field = make()
     positions, directions = points(40, 8)
     noise = torch.from_numpy(np.random.default_rng(1).normal(size=40))
@@ -133,7 +133,7 @@ def test_a_part_of_the_points_gives_that_part_of_the_answer() -> None:
     torch.testing.assert_close(some_color, color[kept], rtol=0, atol=1e-14)
 
 
-def test_no_points_are_no_answer() -> None:
+def test_no_points_give_empty_results() -> None:
     _, directions = points(1, 4)
     density, color = make()(torch.zeros(0, 3).double(), directions, torch.zeros(0, dtype=torch.int64))
     assert (density.shape, color.shape) == ((0,), (0, 3))

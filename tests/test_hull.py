@@ -153,7 +153,7 @@ def test_a_rectangle_holds_all_of_its_cell() -> None:
         assert np.median(np.max(worst, axis=0)) > 0.3  # and is not much larger: 0.5 would touch it
 
 
-def test_a_cell_around_a_camera_is_not_judged_by_it() -> None:
+def test_a_cell_around_a_camera_straddles_its_plane() -> None:
     views = views_of(rods())
     pose = views.cameras.camera_to_worlds[0].numpy()
     centers = pose[:, 3] - np.array([[0.0], [1.0], [-1.0]]) * pose[:, 2]
@@ -207,7 +207,7 @@ def test_wrong_masks_carve_nothing_away(damage: Callable[[int, np.ndarray], np.n
 
 
 @pytest.mark.parametrize(("damage", "name", "value"), [(shifted, "MARGIN", 0), (half_in_one, "MIN_EMPTY_VIEWS", 1)])
-def test_without_margin_or_witnesses_they_would(
+def test_without_margin_or_a_second_view_wrong_masks_carve(
     damage: Callable[[int, np.ndarray], np.ndarray], name: str, value: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views = views_of(rods())
@@ -343,7 +343,7 @@ def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None
 
 
 @pytest.mark.parametrize(("size", "max_level"), [(100, 2), (800, 2), (20, 0)])
-def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int, max_level: int) -> None:
+def test_where_nothing_is_carved_cells_begin_large_enough_to_be_subdivided(size: int, max_level: int) -> None:
     views = views_of(rods(), size, 4)
     analysis = analyze_views(views, LeanModelConfig(cull_by_alpha=False))
     assert analysis.max_level == max_level
@@ -363,23 +363,23 @@ def test_where_nothing_is_carved_cells_begin_large_enough_to_be_split(size: int,
     assert float(carved.grid().cell_size) == pytest.approx(2 * carved.hull.cell_size)
 
 
-# -- live pixels
+# -- pixels whose rays hit the hull
 
 
-def test_every_pixel_whose_ray_meets_a_cell_is_live_and_few_others() -> None:
+def test_every_pixel_whose_ray_hits_the_hull_is_found_and_few_others() -> None:
     views = views_of(rods())
     hull = hull_of(views)
     grid, cameras = OccupancyGrid.from_hull(hull), views.cameras.to(dtype=torch.float32)
-    dead = 0
-    for number, live in enumerate(find_hit_pixels(views, hull)):
+    needless = 0
+    for number, hit in enumerate(find_hit_pixels(views, hull)):
         rays = cameras.image_rays(number)
         meets = torch.bincount(grid.march(rays, hull.cell_size / 4, None).ray_indices, minlength=len(rays)).numpy() > 0
-        assert not (meets & ~live.reshape(-1)).any()
-        dead += (live.reshape(-1) & ~meets).mean()
-    assert 0 < dead / VIEWS < 0.1
+        assert not (meets & ~hit.reshape(-1)).any()
+        needless += (hit.reshape(-1) & ~meets).mean()
+    assert 0 < needless / VIEWS < 0.1
 
 
-def test_what_lies_behind_or_beside_an_image_makes_no_pixel_live() -> None:
+def test_cells_behind_the_camera_or_outside_its_image_hit_no_pixel() -> None:
     """A cell just before the camera's plane, far to the side, projects to a rectangle of thousands of pixels."""
     views = views_of(rods())
     pose = views.cameras.camera_to_worlds[0].numpy()
@@ -392,16 +392,16 @@ def test_what_lies_behind_or_beside_an_image_makes_no_pixel_live() -> None:
     assert find_hit_pixels(views, close)[0].all()
 
 
-def test_pixels_are_spread_over_masks_of_any_size() -> None:
+def test_picked_pixels_are_spread_over_masks_of_any_size() -> None:
     masks = {3: np.zeros((4, 5), dtype=bool), 1: np.ones((2, 3), dtype=bool), 7: np.eye(3, dtype=bool)}
     all_of_them = pick_pixels(masks, 100).tolist()
     assert all_of_them == [[1, r, c] for r in range(2) for c in range(3)] + [[7, i, i] for i in range(3)]
     assert pick_pixels(masks, 3).tolist() == [[1, 0, 0], [1, 1, 1], [7, 2, 2]]
 
 
-def test_a_camera_inside_of_the_hull_may_train_on_all_its_pixels() -> None:
+def test_all_pixels_of_a_camera_inside_the_hull_are_found() -> None:
     views = views_of(rods())
     box = Box(np.zeros(3), 2.0)
     around = Hull(np.full(3, -6.0), 12.0, np.ones((1, 1, 1), dtype=bool))
-    assert all(live.all() for live in find_hit_pixels(views, around))
+    assert all(hit.all() for hit in find_hit_pixels(views, around))
     assert box.half_extent == 2

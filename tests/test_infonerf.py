@@ -155,7 +155,7 @@ def test_one_training_view_is_its_own_neighbour() -> None:
     torch.testing.assert_close(rays.origins, expected)
 
 
-def test_turning_is_about_x_y_and_z_and_moves_no_point_of_the_world() -> None:
+def test_rotation_is_about_z_y_and_x_around_the_origin() -> None:
     angles = torch.tensor([0.1, -0.2, 0.3]).double()
     about = [rotation(axis, math.degrees(a)) for axis, a in zip(np.eye(3).tolist(), angles.tolist(), strict=True)]
     torch.testing.assert_close(rotation_matrix(angles), about[0] @ about[1] @ about[2])
@@ -174,7 +174,7 @@ def info_model(**changes: Any) -> InfoNeRFModel:
     return InfoNeRFModel(InfoNeRFModelConfig(**settings), np.random.default_rng(0)).double()
 
 
-def test_the_gains_weight_decays_and_its_turn_is_small_and_new_at_every_step() -> None:
+def test_the_gains_weight_decays_and_its_rotation_is_small_and_new_at_every_step() -> None:
     model = info_model(gain_weight=0.01, gain_rate=0.5, gain_steps=10)
     rotations = []
     for step, weight in [(0, 0.01), (9, 0.01), (10, 0.005), (25, 0.0025)]:
@@ -186,7 +186,7 @@ def test_the_gains_weight_decays_and_its_turn_is_small_and_new_at_every_step() -
     assert len(torch.stack(rotations).unique(dim=0)) == 4
 
 
-def test_unseen_rays_are_asked_for_their_entropy() -> None:
+def test_the_auxiliary_loss_is_the_weighted_entropy_of_unseen_rays() -> None:
     model = info_model(entropy_weight=0.5).train()
     with torch.no_grad():
         model.fine.density.bias.add_(1)  # something to hit
@@ -234,10 +234,10 @@ def trainer_of(method: str, **model: Any) -> Trainer:
 def test_a_step_minimises_the_error_and_the_entropy_of_as_many_unseen_rays() -> None:
     trainer = trainer_of("info-nerf", entropy_weight=0.7)
     manager, model = trainer.pipeline.datamanager, trainer.pipeline.model
-    asked, unseen = [], manager.unseen_rays
+    requested, unseen = [], manager.unseen_rays
 
     def counted(n: int, rng: np.random.Generator) -> RayBundle:
-        asked.append(n)
+        requested.append(n)
         return unseen(n, rng)
 
     manager.unseen_rays = counted
@@ -246,7 +246,7 @@ def test_a_step_minimises_the_error_and_the_entropy_of_as_many_unseen_rays() -> 
         method = getattr(model, name)
         setattr(model, name, lambda *a, method=method, kept=kept: (kept.append(method(*a)), kept[-1])[1])
     loss = trainer.train_iteration(0)
-    assert asked == [trainer.config.pipeline.datamanager.train_num_rays_per_batch]
+    assert requested == [trainer.config.pipeline.datamanager.train_num_rays_per_batch]
     assert loss == pytest.approx(
         float((torch.cat([loss for loss, _ in seen]).mean() + torch.cat(entropy).mean()).detach()), rel=1e-5
     )

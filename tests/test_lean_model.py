@@ -31,7 +31,7 @@ from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.hull import Hull, find_hit_pixels
 
 RAYS = 12
-JUDGE_FROM = 2 * UPDATE_INTERVAL
+FIRST_PRUNING = 2 * UPDATE_INTERVAL
 SIDE = 0.3
 
 
@@ -109,7 +109,7 @@ def test_culled_rendering_equals_dense_rendering_of_zeros_outside(
         torch.testing.assert_close(shown[key], expected[key], rtol=0, atol=1e-9)
 
 
-def test_rays_beside_the_scene_show_the_background_and_teach_nothing() -> None:
+def test_rays_that_miss_the_scene_show_the_background_and_have_no_gradient() -> None:
     model = model_in(ball(0.3)).train()
     rays = tiny_rays(RAYS)
     away = type(rays)(rays.origins, -rays.directions, rays.camera_indices, rays.metadata)
@@ -122,26 +122,26 @@ def test_rays_beside_the_scene_show_the_background_and_teach_nothing() -> None:
 # -- cells that come and go
 
 
-def test_empty_cells_go_and_some_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_cells_are_pruned_and_some_reactivated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean, "DENSITY_BIAS", -20.0)  # nothing anywhere
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert occupied_after(model, JUDGE_FROM - UPDATE_INTERVAL) == before  # too early
-    assert occupied_after(model, JUDGE_FROM + 1) == before  # not the time
-    first = occupied_after(model, JUDGE_FROM)
+    assert occupied_after(model, FIRST_PRUNING - UPDATE_INTERVAL) == before  # too early
+    assert occupied_after(model, FIRST_PRUNING + 1) == before  # not the time
+    first = occupied_after(model, FIRST_PRUNING)
     assert 0 < first < 0.1 * before  # a fiftieth on average
     again = cells(model).occupied.clone()
-    occupied_after(model, JUDGE_FROM + UPDATE_INTERVAL)
+    occupied_after(model, FIRST_PRUNING + UPDATE_INTERVAL)
     assert not torch.equal(again, cells(model).occupied)  # others
 
 
-def test_what_was_seen_before_densities_mean_something_does_not_count() -> None:
+def test_densities_of_the_first_interval_do_not_count() -> None:
     model = model_in(ball()).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(2000), {"image": torch.ones(2000, 3).double()})
     assert occupied_after(model, UPDATE_INTERVAL) == before
-    assert occupied_after(model, JUDGE_FROM) < 0.1 * before  # nothing was seen since
+    assert occupied_after(model, FIRST_PRUNING) < 0.1 * before  # nothing was seen since
 
 
 def test_a_dense_cell_stays() -> None:
@@ -150,7 +150,7 @@ def test_a_dense_cell_stays() -> None:
     for seed in range(3):
         rays = tiny_rays(2000, seed)
         model.training_loss(rays, {"image": torch.ones(2000, 3).double()})
-    assert occupied_after(model, JUDGE_FROM) > 0.95 * before
+    assert occupied_after(model, FIRST_PRUNING) > 0.95 * before
 
 
 def test_without_features_there_is_the_network_alone() -> None:
@@ -164,20 +164,20 @@ def test_without_features_there_is_the_network_alone() -> None:
 
 
 @pytest.mark.parametrize("off", [{"cull_by_density": False}, {"empty_space_skipping": False}])
-def test_a_part_that_is_off_judges_nothing(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_culling_nothing_is_pruned(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean, "DENSITY_BIAS", -20.0)
     model = model_in(ball(), **off).train()
     before = int(cells(model).occupied.sum())
     model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
     assert not bool(cells(model).max_density.any())
-    assert occupied_after(model, JUDGE_FROM) == before
+    assert occupied_after(model, FIRST_PRUNING) == before
 
 
-def test_judgements_are_a_function_of_the_seed() -> None:
+def test_pruning_is_a_function_of_the_seed() -> None:
     one, other = (model_in(ball()) for _ in range(2))
     for model in (one, other):
         torch.rand(3)  # the global generator is nobody's
-        model.begin_step(JUDGE_FROM, 11)
+        model.begin_step(FIRST_PRUNING, 11)
     assert torch.equal(cells(one).occupied, cells(other).occupied)
 
 
@@ -185,7 +185,7 @@ def test_judgements_are_a_function_of_the_seed() -> None:
 
 
 @pytest.mark.parametrize("count", [6, 40])
-def test_a_box_of_which_nothing_is_known_can_be_seen_through_at_first(count: int) -> None:
+def test_an_uncarved_box_is_transparent_at_first(count: int) -> None:
     size = 3.0
     cube = Hull(np.full(3, -size / 2), size / count, np.ones((count, count, count), dtype=bool))
     config = LeanModelConfig("tiny", 32, 1, 4, 2)
@@ -199,7 +199,7 @@ def test_a_box_of_which_nothing_is_known_can_be_seen_through_at_first(count: int
     assert torch.equal(reloaded(model).eval()(rays)["accumulation_fine"], met)
 
 
-def test_a_state_brings_its_cells() -> None:
+def test_a_state_holds_its_grid() -> None:
     model = model_in(ball())
     cells(model).occupied[3] = False
     fresh = reloaded(model)
@@ -238,7 +238,7 @@ def test_weights_of_another_model_are_refused() -> None:
         saved_grid({"grid.corner": torch.zeros(3)})
 
 
-def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() -> None:
+def test_nerf_on_a_grid_that_is_all_occupied_is_the_dense_nerf() -> None:
     everything, middle = (
         OccupancyGrid.from_hull(Hull(np.full(3, -half), size, np.ones((count,) * 3, dtype=bool)))
         for half, size, count in ((9.0, 1.0, 18), (0.3, 0.2, 3))
@@ -258,22 +258,24 @@ def test_the_original_nerf_in_cells_is_the_dense_one_where_all_are_occupied() ->
 @pytest.fixture
 def larger(tmp_path: Path) -> Path:
     """A scene of enough views and pixels to know where the object is not."""
-    return make_scenes(tmp_path / "made", ["mic"], size=48, num_train=6, num_val=1, num_test=1)[0]
+    return make_scenes(tmp_path / "synthetic", ["mic"], size=48, num_train=6, num_val=1, num_test=1)[0]
 
 
-def lean_config(scene: Path, place: Path, **model: Any) -> TrainerConfig:
+def lean_config(scene: Path, output_dir: Path, **model: Any) -> TrainerConfig:
     config: TrainerConfig = method_configs()["lean-nerf"]
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=128)
     pipeline = replace(config.pipeline, datamanager=manager, model=replace(config.pipeline.model, **model))
     machine = replace(config.machine, device_type="cpu")
-    return replace(config, data=scene, output_dir=place, max_num_iterations=120, pipeline=pipeline, machine=machine)
+    return replace(
+        config, data=scene, output_dir=output_dir, max_num_iterations=120, pipeline=pipeline, machine=machine
+    )
 
 
 def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path))
     model = trainer.pipeline.model
     views = trainer.pipeline.datamanager
-    assert not bool(views.image_batch["mask"].all())  # live pixels alone
+    assert not bool(views.image_batch["mask"].all())  # only pixels whose rays hit the hull
     assert views.train_pixel_sampler.strategy == "uniform"
     trainer.train()
     picture = to_pictures(read_blender(larger, "test"))[0]
@@ -346,29 +348,24 @@ def test_from_the_command_line(scene: Path, tmp_path: Path, edge_se: Any) -> Non
 def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: Any) -> None:
     answer = edge_se("inspect", "--data", larger, "--output-path", tmp_path / "inspect.png")
     assert answer.code == 0, answer
-    said = dict(line.split(maxsplit=1) for line in answer.out.splitlines()[:-1])
+    findings = dict(line.split(maxsplit=1) for line in answer.out.splitlines()[:-1])
     analysis = analyze_views(read_blender(larger, "train"), LeanModelConfig())
-    assert f"{analysis.hull.cells.sum():,} of" in said["cells"]
-    assert said["silhouettes"].startswith("6 of 6 views")
-    assert said["pixel"].startswith(f"{analysis.pixel_footprint:.4f}")
-    live = find_hit_pixels(read_blender(larger, "train"), analysis.hull)
-    assert said["rays"].startswith(f"{100 * np.mean(live):.1f} %")
+    assert f"{analysis.hull.cells.sum():,} of" in findings["cells"]
+    assert findings["silhouettes"].startswith("6 of 6 views")
+    assert findings["pixel"].startswith(f"{analysis.pixel_footprint:.4f}")
+    hit = find_hit_pixels(read_blender(larger, "train"), analysis.hull)
+    assert findings["rays"].startswith(f"{100 * np.mean(hit):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
-    assert said["sampling"].startswith("uniform")
+    assert findings["sampling"].startswith("uniform")
     wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.pixel_footprint
     assert wave > 2  # pixels: no more than the cameras resolve
-    assert said["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
-    assert said["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
+    assert findings["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
+    assert findings["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
     assert "by edges as long as they pay" in unlocated
     large = analyze_views(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
-    assert (
-        f"training begins with {large.hull.cell_size:.4f}, split to {large.hull.cell_size / 2:.4f} where" in unlocated
-    )
-    assert (
-        f"training begins with {2 * analysis.hull.cell_size:.4f}, split to {analysis.hull.cell_size:.4f} where"
-        in said["cells"]
-    )
+    for cells_line, finest in ((unlocated, large.hull.cell_size / 2), (findings["cells"], analysis.hull.cell_size)):
+        assert f"training begins with {2 * finest:.4f}, subdivided to {finest:.4f} if dense" in cells_line
     whole = large.hull.cells
     assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
     for flag, value in (

@@ -148,13 +148,13 @@ def test_density_noise_acts_in_training_alone(monkeypatch: pytest.MonkeyPatch) -
 # --- background ---
 
 
-@pytest.mark.parametrize(("name", "shade"), [("white", 1.0), ("black", 0.0)])
+@pytest.mark.parametrize(("name", "gray"), [("white", 1.0), ("black", 0.0)])
 @pytest.mark.parametrize("training", [True, False])
-def test_an_empty_model_shows_its_background(name: Any, shade: float, training: bool) -> None:
+def test_an_empty_model_shows_its_background(name: Any, gray: float, training: bool) -> None:
     model = with_constant_density(tiny_model(background_color=name), -1).train(training)
     outputs = rendered(model)
     for level in ("coarse", "fine"):
-        assert bool((outputs[f"rgb_{level}"] == shade).all())
+        assert bool((outputs[f"rgb_{level}"] == gray).all())
         assert not outputs[f"accumulation_{level}"].any()
     far = 6 * tiny_rays(RAYS).metadata["directions_norm"]
     if training:  # the last sample is somewhere in the last bin, from 5.6 on
@@ -163,19 +163,19 @@ def test_an_empty_model_shows_its_background(name: Any, shade: float, training: 
         torch.testing.assert_close(outputs["depth_fine"], far)
 
 
-def test_a_random_background_is_behind_prediction_and_target_alike() -> None:
+def test_a_random_background_is_the_same_for_prediction_and_target() -> None:
     model = with_constant_density(tiny_model(background_color="random"), -1).train()
     outputs = rendered(model)
-    behind = outputs["background"]
-    assert bool(((behind >= 0) & (behind <= 1)).all())
-    assert len(torch.unique(behind)) == RAYS * 3  # another colour for every ray
-    assert torch.equal(outputs["rgb_coarse"], behind)
-    assert torch.equal(outputs["rgb_fine"], behind)
+    background = outputs["background"]
+    assert bool(((background >= 0) & (background <= 1)).all())
+    assert len(torch.unique(background)) == RAYS * 3  # another colour for every ray
+    assert torch.equal(outputs["rgb_coarse"], background)
+    assert torch.equal(outputs["rgb_fine"], background)
     image = pixels()
     image[:, 3] = 0
     assert not model.loss(outputs, {"image": image})[0].any()
     image[:, 3] = 1
-    torch.testing.assert_close(model.squared_error(outputs, image), (behind - image[:, :3]).square().sum(1))
+    torch.testing.assert_close(model.squared_error(outputs, image), (background - image[:, :3]).square().sum(1))
     assert bool((rendered(model.eval())["background"] == 1).all())
 
 
@@ -229,7 +229,7 @@ def test_the_loss_is_coarse_and_fine_error_a_mean_over_channels() -> None:
 
 
 def hold_importance(model: NeRFModel) -> None:
-    """From now on the importance samples are those of the next call: no gradient flows through their places."""
+    """From now on the importance samples are those of the next call: no gradient flows through their positions."""
     draw, held = model._importance, []
 
     def first(t: Tensor, weights: Tensor) -> Tensor:
@@ -273,11 +273,11 @@ def mask_density(field: nn.Module, occupied: Callable[[Tensor], Tensor]) -> None
     """Evaluate everywhere, and throw away what lies where there is nothing: dense culling."""
     forward = field.forward
 
-    def masked(positions: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
+    def mcalls(positions: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
         density, color = forward(positions, *others)
         return density * occupied(positions), color
 
-    field.forward = masked
+    field.forward = mcalls
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -302,13 +302,13 @@ def test_culled_rendering_equals_dense_rendering_of_zeros(training: bool, activa
         assert one.grad is not None
 
 
-def test_no_network_is_asked_in_empty_space(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_network_is_evaluated_in_empty_space(monkeypatch: pytest.MonkeyPatch) -> None:
     everywhere = recorded((dense := tiny_model().eval()).fine, monkeypatch)
     rendered(dense)
     model = tiny_model(grid=ball_grid(1.2)).eval()
-    asked = recorded(model.coarse, monkeypatch)
+    calls = recorded(model.coarse, monkeypatch)
     rendered(model)
-    positions, _, ray_indices, _ = asked[0]
+    positions, _, ray_indices, _ = calls[0]
     assert 0 < len(positions) < RAYS * 6
     assert bool(ball_grid(1.2).contains(positions).all())
     rays = tiny_rays(RAYS)
@@ -318,7 +318,7 @@ def test_no_network_is_asked_in_empty_space(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(everywhere[0][0]) == RAYS * 11
 
 
-def test_where_nothing_is_occupied_the_background_stays_and_nothing_is_learnt() -> None:
+def test_where_nothing_is_occupied_the_background_stays_and_there_is_no_gradient() -> None:
     model = tiny_model(grid=ball_grid(0)).train()
     outputs = rendered(model)
     assert bool((outputs["rgb_fine"] == 1).all())

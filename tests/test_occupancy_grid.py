@@ -104,10 +104,10 @@ def test_a_direction_along_an_axis_is_no_division_by_zero() -> None:
     assert len(samples.t) == pytest.approx(7 * SIDE / 0.05, abs=1)
 
 
-# -- what training teaches
+# -- pruning and subdividing
 
 
-def test_cells_without_density_go_their_neighbours_stay_and_none_outside_the_hull_comes() -> None:
+def test_pruning_keeps_dense_cells_and_their_neighbours_within_the_hull() -> None:
     shown = np.ones((7, 5, 6), dtype=bool)
     shown[0] = False
     grid = grid_of(shown)
@@ -117,11 +117,11 @@ def test_cells_without_density_go_their_neighbours_stay_and_none_outside_the_hul
     grid.update_max_density(samples, torch.where(samples.cell_indices == number, 5.0, 0.5).double())
     none = torch.zeros_like(grid.static_mask)
     grid.prune(1.0, none)
-    place = np.unravel_index(int(number), grid.static_mask.shape)
+    index = np.unravel_index(int(number), grid.static_mask.shape)
     expected = torch.zeros_like(grid.static_mask)
-    expected[tuple(slice(at - 1, at + 2) for at in place)] = True
+    expected[tuple(slice(at - 1, at + 2) for at in index)] = True
     assert torch.equal(grid.occupied, expected & grid.static_mask)
-    assert not bool(grid.max_density.any())  # the next judgement is of what is seen from now on
+    assert not bool(grid.max_density.any())  # begins again
 
     again = none.clone()
     again[2, 1, 1] = again[0, 0, 0] = True
@@ -140,7 +140,7 @@ def test_the_largest_density_of_a_cell_counts() -> None:
     np.testing.assert_array_equal(grid.max_density.reshape(-1).numpy(), expected)
 
 
-def test_a_split_moves_nothing() -> None:
+def test_subdividing_keeps_the_box_and_what_is_occupied() -> None:
     shown, points = cells(), torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (5000, 3)))
     hull = Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown)
     grid, whole = OccupancyGrid.from_hull(hull, 2).double(), grid_of(shown)
@@ -159,7 +159,7 @@ def test_a_split_moves_nothing() -> None:
     assert loaded.is_of_the_same_scene(OccupancyGrid.from_hull(hull, 2))
 
 
-def test_doubled_cells_have_whatever_the_hull_has_and_split_are_the_hull() -> None:
+def test_coarse_cells_cover_the_hull_and_subdivided_ones_equal_it() -> None:
     shown, points = cells(), torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (5000, 3)))
     hull = Hull(-np.array(shown.shape) * SIDE / 2, SIDE, shown)
     grid, whole = OccupancyGrid.from_hull(hull, 2, 2).double(), grid_of(shown)

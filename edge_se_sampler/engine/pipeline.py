@@ -51,7 +51,7 @@ class Pipeline:
             if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
                 raise InputError(
                     "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
-                    "this machine rounds otherwise; resume with what it began with, or train anew"
+                    "this machine rounds differently; restore the data, or begin a new training"
                 )
             if manager_config.skip_empty_rays and has_masks:
                 views = views.with_masks(find_hit_pixels(views, analysis.hull))

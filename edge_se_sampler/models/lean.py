@@ -7,7 +7,6 @@ sigma   exp(raw) / h, density: independent of the scene's scale, and never 0, so
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -28,7 +27,6 @@ from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.features import FeatureGrid
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid, dilate, upsample
 
-RAYS_PER_CHUNK = 4096
 DENSITY_BIAS = -1.0
 """Raw density at first: thin enough to see through the object, dense enough to have a gradient. In an uncarved box it
 would be an opaque fog: there, the box has an optical depth of 1 across."""
@@ -116,13 +114,9 @@ class LeanModel(RayModel):
         self.features = FeatureGrid(grid, config.feature_dim) if config.feature_dim else None
 
     @property
-    def device(self) -> torch.device:
-        """The device of the weights."""
-        return self.fine.density.weight.device
-
-    def chunks(self, rays: int) -> Iterator[slice]:
-        """Slices of that many rays, each small enough to be rendered at once."""
-        return (slice(start, start + RAYS_PER_CHUNK) for start in range(0, rays, RAYS_PER_CHUNK))
+    def rays_per_chunk(self) -> int:
+        """As `RayModel`."""
+        return 4096
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """The features learn faster than the network: each sees few samples."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -41,15 +39,10 @@ class NeRFModel(RayModel):
         self.fine = NeRFField(config, rng)
 
     @property
-    def device(self) -> torch.device:
-        """The device of the weights."""
-        return self.coarse.density.weight.device
-
-    def chunks(self, rays: int) -> Iterator[slice]:
-        """Slices of that many rays, each small enough to be rendered at once."""
-        points = 2 * self.num_coarse_samples + self.num_importance_samples
-        size = max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points)
-        return (slice(start, start + size) for start in range(0, rays, size))
+    def rays_per_chunk(self) -> int:
+        """As `RayModel`."""
+        points_per_ray = 2 * self.num_coarse_samples + self.num_importance_samples
+        return max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points_per_ray)
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`; and density_fine, delta_fine (n, s) of the fine network's samples."""
@@ -111,6 +104,5 @@ class NeRFModel(RayModel):
         """(count,) noise on the raw density, in training only."""
         if not (self.training and self.config.density_noise):
             return None
-        dtype = self.coarse.density.weight.dtype
-        standard = torch.randn(count, generator=self.random, device=self.device, dtype=dtype)
-        return standard * self.config.density_noise
+        noise = torch.randn(count, generator=self.random, device=self.device, dtype=self.dtype)
+        return noise * self.config.density_noise

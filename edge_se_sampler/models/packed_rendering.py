@@ -8,7 +8,7 @@ g      gradient of the loss by a ray's (colour, accumulation)
 s      w (c, 1) . g: what a sample contributes to the loss, to first order
 
 d loss / d c_i = w_i g, and d loss / d tau_i = T_i exp(-tau_i) (c_i, 1) . g - (sum of the s_j after i): more depth at
-i shows more of its own colour and less of everything behind it. Sums along a ray are differences of one running sum,
+i shows more of its own colour and less of everything after it. Sums along a ray are differences of one running sum,
 in float64, for it runs over all rays.
 """
 

@@ -36,13 +36,24 @@ class RayModel(nn.Module, ABC):
         """n rays -> (n, 3) background colours in [0, 1], in place of the config's background color."""
 
     @property
-    @abstractmethod
     def device(self) -> torch.device:
         """The device of the weights."""
+        return next(self.parameters()).device
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The floating point type of the weights."""
+        return next(self.parameters()).dtype
+
+    @property
     @abstractmethod
-    def chunks(self, rays: int) -> Iterator[slice]:
+    def rays_per_chunk(self) -> int:
+        """How many rays are rendered at once, which bounds the memory."""
+
+    def chunks(self, num_rays: int) -> Iterator[slice]:
         """Slices of that many rays, each small enough to be rendered at once."""
+        size = self.rays_per_chunk
+        return (slice(start, start + size) for start in range(0, num_rays, size))
 
     @abstractmethod
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
@@ -98,11 +109,6 @@ class RayModel(nn.Module, ABC):
         if self.training and self.config.background_color == "random":
             return self.uniform(len(rays), 3)
         return torch.full((len(rays), 3), self.config.background_level, device=self.device, dtype=self.dtype)
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The floating point type of the weights."""
-        return next(self.parameters()).dtype
 
     def uniform(self, rows: int, columns: int) -> Tensor:
         """(rows, columns) uniform draws in [0, 1) from the step's generator."""

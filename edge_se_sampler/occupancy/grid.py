@@ -121,11 +121,11 @@ class OccupancyGrid(nn.Module):
 
     def is_of_the_same_scene(self, other: OccupancyGrid) -> bool:
         """Whether both began with the same cells, whatever has been pruned and subdivided since."""
-        begun = [
+        initial = [
             (grid.aabb_min, grid.initial_cell_size, grid.hull, grid.max_level, grid.static_mask_at(0))
             for grid in (self, other)
         ]
-        return all(torch.equal(one.cpu(), another.cpu()) for one, another in zip(*begun, strict=True))
+        return all(torch.equal(one.cpu(), another.cpu()) for one, another in zip(*initial, strict=True))
 
     def subdivide(self) -> None:
         """Halve all cells along every axis."""
