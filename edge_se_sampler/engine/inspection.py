@@ -73,11 +73,7 @@ def _findings(
         "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",
         "cells": f"{hull.cell_size:.4f} a side, {hull.cell_size / footprint:.1f} pixels; {num_occupied:,} of "
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)"
-        + (
-            f"; training begins with {first:.4f}, subdivided to {finest:.4f} where it sees any"
-            if first > finest
-            else ""
-        ),
+        + (f"; training begins with {first:.4f}, subdivided to {finest:.4f} if dense" if first > finest else ""),
         "encoding": f"{preset.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; "
         f"what is finer is left to {config.feature_dim} features at every corner of a cell",
         "network": f"{preset.depth} x {preset.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size "
