@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
@@ -190,12 +190,9 @@ class Show:
         from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.engine.show import show
 
-        for flag, value in (
-            ("num-views", self.num_views),
-            ("pixel-sampler.num-rays-per-batch", self.pixel_sampler.num_rays_per_batch),
-        ):
-            if value < 1:
-                raise InputError(f"--{flag} is {value}: must be at least 1")
+        rays = self.pixel_sampler.num_rays_per_batch
+        check_value("num-views", self.num_views, self.num_views >= 1, "at least 1")
+        check_value("pixel-sampler.num-rays-per-batch", rays, rays >= 1, "at least 1")
         check_output(self.output_path)
         views = read_blender(self.data, "train")
         show(views, self.pixel_sampler, self.strategy, self.output_path, self.num_views, self.seed)

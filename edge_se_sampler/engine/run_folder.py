@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import itertools
@@ -116,16 +117,14 @@ class RunFolder:
         write_image(self.path / "previews" / f"step-{step:09d}.png", image)
 
 
-def _new_folder(parent: Path, stamp: str) -> Path:
-    """parent/stamp, or the first of stamp-1, stamp-2, ... that is free."""
-    for attempt in itertools.count():
-        path = parent / (f"{stamp}-{attempt}" if attempt else stamp)
-        try:
+def _new_folder(parent: Path, name: str) -> Path:
+    """Create parent/name, or the first of name-1, name-2, ... that does not exist."""
+    paths = (parent / (f"{name}-{attempt}" if attempt else name) for attempt in itertools.count())
+    while True:
+        with contextlib.suppress(FileExistsError):
+            path = next(paths)
             path.mkdir()
-        except FileExistsError:
-            continue
-        return path
-    raise AssertionError  # count() does not end
+            return path
 
 
 def config_to_json(config: TrainerConfig) -> dict[str, Any]:

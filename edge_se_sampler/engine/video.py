@@ -15,7 +15,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_rays
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_test_views, read_train_views
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, check_value
 
 
 def render_run(
@@ -27,8 +27,8 @@ def render_run(
         InputError: a bad run, or an output that cannot be written.
     """
     check_video(output_path, frames_per_second)
-    if num_frames < 1 or frames_per_second < 1:
-        raise InputError("--num-frames and --frames-per-second must be at least 1")
+    check_value("num-frames", num_frames, num_frames >= 1, "at least 1")
+    check_value("frames-per-second", frames_per_second, frames_per_second >= 1, "at least 1")
     model, _ = load_model(run, config)
     if kind == "spiral":
         cameras = spiral(read_train_views(config).cameras, num_frames)
