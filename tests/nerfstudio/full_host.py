@@ -71,7 +71,7 @@ def watch(sampler: Any) -> list[tuple[int, str, torch.Tensor]]:
     def watched(image_batch: dict[str, Any]) -> dict[str, Any]:
         strategy = sampler.strategy
         batch = sample(image_batch)
-        seen.append((sampler._step, strategy, batch["indices"]))
+        seen.append((sampler._step.number, strategy, batch["indices"]))
         return batch
 
     sampler.sample = watched

@@ -96,7 +96,7 @@ def test_nerfactos_proposal_networks_learn_at_the_same_steps_as_without_scoring(
     plain = proposal_gradients(trainer_of(config), 25, score=False)
     assert 0 < plain.count(True) < len(plain)
     assert proposal_gradients(trainer_of(config), 25, score=True) == plain
-    monkeypatch.setattr(scoring, "_without_trace", as_any_forward_pass)
+    monkeypatch.setattr(scoring, "_preserved_state", as_any_forward_pass)
     assert not any(proposal_gradients(trainer_of(config), 25, score=True))  # the trap: none ever again
 
 
@@ -124,7 +124,7 @@ def test_the_score_is_what_the_loss_averages(
     batch = candidates_of(trainer)
     rays = trainer.pipeline.datamanager.train_ray_generator(batch["indices"])
     # the same random numbers in both; the colour of a random background is drawn anew for every comparison
-    monkeypatch.setattr(scoring, "_without_trace", as_any_forward_pass)
+    monkeypatch.setattr(scoring, "_preserved_state", as_any_forward_pass)
     monkeypatch.setattr(torch, "rand_like", lambda image: torch.full_like(image, 0.3))
     with torch.no_grad():
         torch.manual_seed(3)
