@@ -10,7 +10,7 @@ import pytest
 from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import DISTANCE, Camera, framing, poses
 from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
-from edge_se_sampler.data.synthetic.linear import inverse_affine, rotation, unit
+from edge_se_sampler.data.synthetic.linear import invert, rotation, unit
 from edge_se_sampler.data.synthetic.render import SAMPLES_PER_AXIS, render
 from edge_se_sampler.data.synthetic.scene import BALL_RADIUS, Material, Scene, SceneBuilder
 from edge_se_sampler.data.synthetic.solids import Kind, hit_distance, outward_normals
@@ -192,12 +192,12 @@ def test_alpha_of_a_ball_is_its_silhouette() -> None:
     assert picture[faint, :3].min() >= 0.75 * picture[alpha == 255, :3].min()
 
 
-def test_inverse_affine_inverts() -> None:
+def test_invert_inverts_affine_maps() -> None:
     m = np.random.RandomState(4).randn(3, 4, 20)
     square = np.zeros((20, 4, 4))
     square[:, 3, 3] = 1
     square[:, :3] = np.moveaxis(m, -1, 0)
-    np.testing.assert_allclose(np.moveaxis(inverse_affine(m), -1, 0), np.linalg.inv(square)[:, :3], rtol=1e-9)
+    np.testing.assert_allclose(np.moveaxis(invert(m), -1, 0), np.linalg.inv(square)[:, :3], rtol=1e-9)
 
 
 def test_rotation_is_right_handed() -> None:

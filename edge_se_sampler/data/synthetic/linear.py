@@ -38,6 +38,21 @@ def length(a: Array) -> Array:
     return np.sqrt(dot(a, a))
 
 
+def around(radius: float, angle: float, z: float = 0.0) -> Array:
+    """The point (3,) at an angle (radians) on a horizontal circle around the z axis."""
+    return vector([radius * math.cos(angle), radius * math.sin(angle), z])
+
+
+def ring(radius: float, corners: int, z: float = 0.0) -> list[Array]:
+    """A closed horizontal polygon around the z axis: corners + 1 points (3,)."""
+    return [around(radius, 2 * math.pi * k / corners, z) for k in range(corners + 1)]
+
+
+def spaced(first: float, last: float, count: int) -> list[float]:
+    """`count` numbers from first to last, evenly."""
+    return [first + (last - first) * k / (count - 1) for k in range(count)]
+
+
 def unit(a: ArrayLike) -> Array:
     """The vector (3, ...) scaled to length 1."""
     a = vector(a)
@@ -59,8 +74,8 @@ def affine(linear: Array, translation: Array) -> Array:
     return np.concatenate([linear, translation[:, None]], axis=1)
 
 
-def inverse_affine(m: Array) -> Array:
-    """Inverse (3, 4, ...) of an affine map (3, 4, ...), in closed form."""
+def invert(m: Array) -> Array:
+    """The inverse (3, 4, ...) of an affine map (3, 4, ...), in closed form."""
     x, y, z = m[:, 0], m[:, 1], m[:, 2]
     rows = np.stack([cross(y, z), cross(z, x), cross(x, y)])
     linear = rows / dot(x, rows[0])

@@ -6,6 +6,8 @@ q  point times the pattern's frequency, so that a period is 1; in the world for 
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from edge_se_sampler.data.synthetic.linear import Array, Index
@@ -21,16 +23,16 @@ def second_color_weight(pattern: int, world: Array, local: Array, frequency: Arr
         i, j, k = np.floor(q + 1e-4)  # 1e-4: a face that lies in a lattice plane does not flicker
         return np.mod(i + j + k, 2)
     if pattern == Pattern.STRIPES:
-        return (_fraction(q[0] + q[1]) < 0.35).astype(np.float64)
+        return ((q[0] + q[1]) % 1 < 0.35).astype(np.float64)
     if pattern == Pattern.BLOTCHES:
         return np.clip(1.6 * (0.65 * value_noise(q) + 0.35 * value_noise(2.03 * q)) - 0.3, 0, 1)
     if pattern == Pattern.RINGS:
         x, y = local[:2] * frequency
-        return (_fraction(np.sqrt(x * x + y * y)) < 0.3).astype(np.float64)
+        return (np.sqrt(x * x + y * y) % 1 < 0.3).astype(np.float64)
     if pattern == Pattern.WOOD:
         years = np.sqrt(q[0] * q[0] + q[1] * q[1])
         waver = value_noise(np.stack([q[0], q[1], 0.3 * q[2]]))
-        return smooth_step(np.abs(2 * _fraction(1.43 * years + 0.8 * waver - 0.25) - 1))
+        return smooth_step(np.abs(2 * ((1.43 * years + 0.8 * waver - 0.25) % 1) - 1))
     return np.zeros(world.shape[1])
 
 
@@ -42,16 +44,13 @@ def smooth_step(x: Array) -> Array:
 def value_noise(q: Array) -> Array:
     """Smooth noise (n,) in 0..1 at points (3, n): fixed random values on whole numbers, blended between them."""
     base = np.floor(q)
-    weight_one = smooth_step(q - base)
-    base = base.astype(np.int64)
+    upper = smooth_step(q - base)
+    weights = (1 - upper, upper)
+    lattice = base.astype(np.int64)
     total = np.zeros(q.shape[1])
-    for i in (0, 1):
-        for j in (0, 1):
-            for k in (0, 1):
-                weight = np.ones(q.shape[1])
-                for axis, step in enumerate((i, j, k)):
-                    weight = weight * (weight_one[axis] if step else 1 - weight_one[axis])
-                total = total + weight * _lattice_value(base[0] + i, base[1] + j, base[2] + k)
+    for i, j, k in product((0, 1), repeat=3):
+        value = _lattice_value(lattice[0] + i, lattice[1] + j, lattice[2] + k)
+        total = total + weights[i][0] * weights[j][1] * weights[k][2] * value
     return total
 
 
@@ -61,7 +60,3 @@ def _lattice_value(i: Index, j: Index, k: Index) -> Array:
     h = (i * a + j * b + k * c) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFF) / 65535
-
-
-def _fraction(x: Array) -> Array:
-    return x - np.floor(x)

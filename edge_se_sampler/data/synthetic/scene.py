@@ -7,24 +7,14 @@ within BALL_RADIUS of it, so that no view clips one. P is the number of solids, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edge_se_sampler.data.synthetic.linear import (
-    Array,
-    Index,
-    affine,
-    apply,
-    cross,
-    dot,
-    inverse_affine,
-    length,
-    vector,
-)
+from edge_se_sampler.data.synthetic.linear import Array, Index, affine, apply, cross, dot, invert, length, unit, vector
 from edge_se_sampler.data.synthetic.solids import Kind
 
 # World units. Small enough that the default offset keeps the ball's image whole when the cameras are rotated instead
@@ -63,19 +53,6 @@ class Material:
 
 
 @dataclass(frozen=True)
-class Materials:
-    """The same, as arrays over M materials."""
-
-    color: Array  # (3, M)
-    second_color: Array  # (3, M)
-    pattern: Index  # (M,) Pattern
-    frequency: Array  # (M,)
-    reflectance: Array  # (M,)
-    roughness: Array  # (M,)
-    metalness: Array  # (M,)
-
-
-@dataclass(frozen=True)
 class Scene:
     """What the renderer reads. Arrays run over P solids in their last axis."""
 
@@ -86,7 +63,7 @@ class Scene:
     corners: Array  # (3, 8, P) of each solid's box, world
     radius: Array  # (P,) of a ball around the solid's center that holds it
     material: Index  # (P,) index into `materials`
-    materials: Materials
+    materials: dict[str, Array]  # by the names of Material's fields: colors (3, M), all else (M,)
 
 
 @dataclass(frozen=True)
@@ -94,8 +71,8 @@ class _Solid:
     kind: Kind
     linear: Array  # (3, 3); its columns are orthogonal
     center: Array  # (3,)
-    taper: tuple[float, float]
     material: Material
+    taper: tuple[float, float] = (1.0, 0.0)
 
     def reach(self, point: Array) -> float:
         """No point of the solid is farther from `point` than this (exact for boxes, frusta and round spheres)."""
@@ -107,7 +84,7 @@ class _Solid:
         if self.kind == Kind.SPHERE:
             return min(farthest_corner, float(length(away) + half_axes.max()))
         reaches = []
-        for end in (-1.0, 1.0):
+        for end in (-1.0, 1.0):  # over the caps' rims
             rim = half_axes[0] * (self.taper[0] + end * self.taper[1])
             to_cap = away + end * self.linear[:, 2]
             along = dot(to_cap, self.linear[:, 2]) / half_axes[2]
@@ -116,19 +93,20 @@ class _Solid:
         return max(reaches)
 
 
-@dataclass
 class SceneBuilder:
     """Collects solids in any unit and position; `build` fits them into the ball."""
 
-    _solids: list[_Solid] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._solids: list[_Solid] = []
 
     def sphere(self, center: ArrayLike, radii: ArrayLike, material: Material, rotation: Array = _UPRIGHT) -> None:
         """An ellipsoid with half axes `radii` (one number or three) along the columns of `rotation`."""
-        self._add(Kind.SPHERE, rotation * np.broadcast_to(vector(radii), 3), center, material)
+        linear = rotation * np.broadcast_to(vector(radii), 3)
+        self._solids.append(_Solid(Kind.SPHERE, linear, vector(center), material))
 
     def box(self, center: ArrayLike, half_sizes: ArrayLike, material: Material, rotation: Array = _UPRIGHT) -> None:
         """A box with half sizes (3) along the columns of `rotation`."""
-        self._add(Kind.BOX, rotation * vector(half_sizes), center, material)
+        self._solids.append(_Solid(Kind.BOX, rotation * vector(half_sizes), vector(center), material))
 
     def tube(
         self, start: ArrayLike, end: ArrayLike, radius: float, material: Material, end_radius: float | None = None
@@ -137,15 +115,14 @@ class SceneBuilder:
         start, end = vector(start), vector(end)
         end_radius = radius if end_radius is None else end_radius
         half = (end - start) / 2
-        along = half / length(half)
-        aside = cross(along, vector([1, 0, 0] if abs(along[0]) < 0.9 else [0, 1, 0]))
-        aside = aside / length(aside)
+        along = unit(half)
+        aside = unit(cross(along, vector([1, 0, 0] if abs(along[0]) < 0.9 else [0, 1, 0])))
         wide = max(radius, end_radius)
         linear = np.stack([wide * aside, wide * cross(along, aside), half], axis=1)
         taper = ((end_radius + radius) / (2 * wide), (end_radius - radius) / (2 * wide))
-        self._add(Kind.FRUSTUM, linear, (start + end) / 2, material, taper)
+        self._solids.append(_Solid(Kind.FRUSTUM, linear, (start + end) / 2, material, taper))
 
-    def polyline(self, points: Sequence[Array], radius: float, material: Material, joints: bool = True) -> None:
+    def polyline(self, points: Sequence[ArrayLike], radius: float, material: Material, joints: bool = True) -> None:
         """A rod along points (3,), its inner corners rounded by spheres where `joints`."""
         for start, end in pairwise(points):
             self.tube(start, end, radius, material)
@@ -167,24 +144,14 @@ class SceneBuilder:
         half_diagonals = apply(to_world[:, :3, None], _CUBE[..., None])  # (3, 8, P)
         half_axes = length(to_world[:, :3])
         materials = list(dict.fromkeys(solid.material for solid in solids))
-        plain = [replace(m, second_color=m.second_color or m.color) for m in materials]
+        two_colored = [replace(m, second_color=m.second_color or m.color) for m in materials]
         return Scene(
             kind=kind,
             taper=np.array([solid.taper for solid in solids]).T,
             to_world=to_world,
-            to_local=inverse_affine(to_world),
+            to_local=invert(to_world),
             corners=half_diagonals + to_world[:, 3][:, None],
             radius=np.where(kind == Kind.SPHERE, half_axes.max(axis=0), length(half_diagonals).max(axis=0)),
             material=np.array([materials.index(solid.material) for solid in solids]),
-            materials=Materials(**{f.name: np.array([getattr(m, f.name) for m in plain]).T for f in fields(Materials)}),
+            materials={f.name: np.array([getattr(m, f.name) for m in two_colored]).T for f in fields(Material)},
         )
-
-    def _add(
-        self,
-        kind: Kind,
-        linear: Array,
-        center: ArrayLike,
-        material: Material,
-        taper: tuple[float, float] = (1.0, 0.0),
-    ) -> None:
-        self._solids.append(_Solid(kind, linear, vector(center), taper, material))

@@ -13,7 +13,7 @@ import numpy as np
 
 from edge_se_sampler.data.synthetic.linear import Array, Index, apply, dot, unit, vector
 from edge_se_sampler.data.synthetic.patterns import second_color_weight, smooth_step
-from edge_se_sampler.data.synthetic.scene import Pattern, Scene
+from edge_se_sampler.data.synthetic.scene import Scene
 from edge_se_sampler.data.synthetic.solids import outward_normals
 from edge_se_sampler.data.synthetic.visibility import KEY_DIRECTION, NOTHING, in_shadow, nearest_hits
 
@@ -37,10 +37,9 @@ def radiance(scene: Scene, solid: Index, points: Array, rays: Array, *, bounces:
     With `bounces` 0, as things look in a mirror, shadows and further mirrors are left out.
     """
     local, normals, cos_eye = _surface(scene, solid, points, rays)
-    material = scene.material[solid]
-    roughness = scene.materials.roughness[material]
-    metalness = scene.materials.metalness[material]
-    albedo = _albedo(scene, material, local, points)
+    material = {name: column[..., scene.material[solid]] for name, column in scene.materials.items()}
+    roughness, metalness = material["roughness"], material["metalness"]
+    albedo = _albedo(material, local, points)
 
     above = points + _OFF_SURFACE * normals
     cos_key = np.maximum(dot(normals, KEY_DIRECTION), 0)
@@ -60,7 +59,7 @@ def radiance(scene: Scene, solid: Index, points: Array, rays: Array, *, bounces:
         smooth = np.nonzero(roughness < _MIRROR_ROUGHNESS)[0]
         _mirror(scene, surroundings, smooth, above, mirrored)
 
-    straight_on = (1 - metalness) * scene.materials.reflectance[material] + metalness * albedo
+    straight_on = (1 - metalness) * material["reflectance"] + metalness * albedo
     away = 1 - cos_eye
     grazing = np.maximum(1 - roughness, straight_on) - straight_on
     fresnel = straight_on + grazing * (away * away * away * away * away)  # Schlick
@@ -80,30 +79,21 @@ def _surface(scene: Scene, solid: Index, points: Array, rays: Array) -> tuple[Ar
 
 def _mirror(scene: Scene, surroundings: Array, which: Index, origins: Array, directions: Array) -> None:
     """Puts what rays `which` meet in the scene into `surroundings`, over the sky."""
-    if len(which) == 0:
-        return
     origins, directions = origins[:, which], directions[:, which]
     t, met = nearest_hits(scene, origins, directions)
     hit = np.nonzero(met != NOTHING)[0]
-    if len(hit) == 0:
-        return
     points = origins[:, hit] + t[hit] * directions[:, hit]
     surroundings[:, which[hit]] = radiance(scene, met[hit], points, directions[:, hit], bounces=0)
 
 
-def _albedo(scene: Scene, material: Index, local: Array, world: Array) -> Array:
+def _albedo(material: dict[str, Array], local: Array, world: Array) -> Array:
     """Base color (3, n) with its pattern."""
-    table = scene.materials
-    albedo = table.color[:, material]
-    patterns = table.pattern[material]
-    for pattern in np.unique(patterns).tolist():
-        if pattern == Pattern.PLAIN:
-            continue
-        which = np.nonzero(patterns == pattern)[0]
-        kind = material[which]
-        weight = second_color_weight(pattern, world[:, which], local[:, which], table.frequency[kind])
-        albedo[:, which] = (1 - weight) * table.color[:, kind] + weight * table.second_color[:, kind]
-    return albedo
+    weight = np.zeros(world.shape[1])
+    for pattern in np.unique(material["pattern"]).tolist():
+        which = np.nonzero(material["pattern"] == pattern)[0]
+        frequency = material["frequency"][which]
+        weight[which] = second_color_weight(pattern, world[:, which], local[:, which], frequency)
+    return (1 - weight) * material["color"] + weight * material["second_color"]
 
 
 def _highlight(normals: Array, rays: Array, roughness: Array) -> Array:

@@ -37,8 +37,6 @@ def first_hits(scene: Scene, camera: Camera, per_axis: int) -> tuple[Array, Inde
     depth = np.full((len(y_slopes), len(x_slopes)), np.inf)
     seen = np.full(depth.shape, NOTHING)
     for solid, (left, right, top, bottom) in enumerate(_windows(scene, camera, per_axis)):
-        if left >= right or top >= bottom:
-            continue
         x = x_slopes[None, left:right]
         y = y_slopes[top:bottom, None]
         along_x, along_y, back = local_rotation[..., solid].T
@@ -77,7 +75,6 @@ def in_shadow(scene: Scene, points: Array) -> NDArray[np.bool_]:
     starts = np.searchsorted(u, corner_u.min(axis=0))
     stops = np.searchsorted(u, corner_u.max(axis=0), side="right")
     lowest_v, highest_v, highest = corner_v.min(axis=0), corner_v.max(axis=0), corner_height.max(axis=0)
-    local_light = apply(scene.to_local[:, :3], KEY_DIRECTION)
     blocked = np.zeros(points.shape[1], dtype=bool)
     for solid, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True)):
         near = np.s_[start:stop]
@@ -85,13 +82,17 @@ def in_shadow(scene: Scene, points: Array) -> NDArray[np.bool_]:
         which = start + np.nonzero(inside & (height[near] < highest[solid]) & ~blocked[near])[0]
         if len(which) == 0:
             continue
-        to_local = scene.to_local[..., solid]
-        origin = apply(to_local[:, :3], points[:, which]) + to_local[:, 3:]
-        t = hit_distance(scene.kind[solid], scene.taper[:, solid], origin, local_light[:, solid], _SELF)
-        blocked[which] = t < np.inf
+        blocked[which] = _hit(scene, solid, points[:, which], KEY_DIRECTION) < np.inf
     answer = np.empty_like(blocked)
     answer[order] = blocked
     return answer
+
+
+def _hit(scene: Scene, solid: int, origins: Array, directions: Array) -> Array:
+    """Where rays from other surfaces, (3, n) with directions (3, n) or (3,), meet one solid: t (n,)."""
+    linear, translation = scene.to_local[:, :3, solid], scene.to_local[:, 3:, solid]
+    origins, directions = apply(linear, origins) + translation, apply(linear, directions)
+    return hit_distance(scene.kind[solid], scene.taper[:, solid], origins, directions, _SELF)
 
 
 def nearest_hits(scene: Scene, origins: Array, directions: Array) -> tuple[Array, Index]:
@@ -109,10 +110,7 @@ def nearest_hits(scene: Scene, origins: Array, directions: Array) -> tuple[Array
         which = np.nonzero((b * b >= c) & ((b < 0) | (c < 0)))[0]  # rays that meet the ball around the solid
         if len(which) == 0:
             continue
-        to_local = scene.to_local[..., solid]
-        origin = apply(to_local[:, :3], origins[:, which]) + to_local[:, 3:]
-        direction = apply(to_local[:, :3], directions[:, which])
-        t = hit_distance(scene.kind[solid], scene.taper[:, solid], origin, direction, _SELF)
+        t = _hit(scene, solid, origins[:, which], directions[:, which])
         nearer = t < nearest[which]
         nearest[which[nearer]] = t[nearer]
         met[which[nearer]] = solid

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from difflib import get_close_matches
 from functools import cache
 
@@ -16,15 +15,7 @@ from edge_se_sampler.data.synthetic.catalogue.mic import mic
 from edge_se_sampler.data.synthetic.scene import Scene, SceneBuilder
 from edge_se_sampler.errors import InputError
 
-_BUILDERS: dict[str, Callable[[SceneBuilder], None]] = {
-    "chair": chair,
-    "drums": drums,
-    "ficus": ficus,
-    "hotdog": hotdog,
-    "bricks": bricks,
-    "materials": materials,
-    "mic": mic,
-}
+_BUILDERS = {builder.__name__: builder for builder in (chair, drums, ficus, hotdog, bricks, materials, mic)}
 SCENE_NAMES = tuple(_BUILDERS)
 ANALOG_OF = {name: "lego" if name == "bricks" else name for name in SCENE_NAMES}
 
@@ -40,10 +31,8 @@ def synthetic_scene(name: str) -> Scene:
 
 def check_name(name: str) -> None:
     """Raises InputError if no synthetic scene is called `name`."""
-    if name in _BUILDERS:
-        return
-    known = {ANALOG_OF[scene]: scene for scene in SCENE_NAMES} | {scene: scene for scene in SCENE_NAMES}
-    nearest = known[get_close_matches(name, known, n=1, cutoff=0)[0]]
-    raise InputError(
-        f"no synthetic scene is called {name!r}: did you mean {nearest!r}? There are {', '.join(SCENE_NAMES)}"
-    )
+    if name not in _BUILDERS:
+        known = {ANALOG_OF[scene]: scene for scene in SCENE_NAMES} | {scene: scene for scene in SCENE_NAMES}
+        nearest = known[get_close_matches(name, known, n=1, cutoff=0)[0]]
+        names = ", ".join(SCENE_NAMES)
+        raise InputError(f"no synthetic scene is called {name!r}: did you mean {nearest!r}? There are {names}")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 from numpy.typing import ArrayLike
 
-from edge_se_sampler.data.synthetic.catalogue.shapes import spaced
-from edge_se_sampler.data.synthetic.linear import rotation, vector
+from edge_se_sampler.data.synthetic.linear import rotation, spaced, vector
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
 YELLOW = Material((0.85, 0.52, 0.03), reflectance=0.05, roughness=0.25)
@@ -22,7 +22,7 @@ STUD = 0.1  # distance between studs
 
 
 def bricks(scene: SceneBuilder) -> None:
-    _brick(scene, (0, 0, -0.62), 18, 12, 0.02, GREEN)
+    _brick(scene, (0, 0, -0.62), (18, 12, 0.02), GREEN)
     for y in (-0.36, 0.36):
         _track(scene, y)
     _body(scene)
@@ -31,23 +31,14 @@ def bricks(scene: SceneBuilder) -> None:
 
 
 def _brick(
-    scene: SceneBuilder,
-    center: ArrayLike,
-    across: int,
-    deep: int,
-    half_height: float,
-    material: Material,
-    studs: bool = True,
+    scene: SceneBuilder, center: ArrayLike, size: tuple[int, int, float], material: Material, studs: bool = True
 ) -> None:
-    """A brick of across x deep studs, with a hair's gap to its neighbours."""
-    center = vector(center)
+    """A brick of so many studs across and deep, and of a half height, with a hair's gap to its neighbours."""
+    across, deep, half_height = size
     scene.box(center, (across * STUD / 2 - 0.002, deep * STUD / 2 - 0.002, half_height), material)
-    if not studs:
-        return
-    for i in range(across):
-        for j in range(deep):
-            foot = center + vector([(i - (across - 1) / 2) * STUD, (j - (deep - 1) / 2) * STUD, half_height])
-            scene.tube(foot, foot + vector([0, 0, 0.028]), 0.031, material)
+    for i, j in product(range(across), range(deep)) if studs else ():
+        foot = center + vector([(i - (across - 1) / 2) * STUD, (j - (deep - 1) / 2) * STUD, half_height])
+        scene.tube(foot, foot + vector([0, 0, 0.028]), 0.031, material)
 
 
 def _track(scene: SceneBuilder, y: float) -> None:
@@ -65,11 +56,11 @@ def _track(scene: SceneBuilder, y: float) -> None:
 
 
 def _body(scene: SceneBuilder) -> None:
-    _brick(scene, (-0.1, 0, -0.26), 8, 5, 0.05, YELLOW, studs=False)
-    _brick(scene, (-0.3, 0, -0.16), 5, 5, 0.05, GRAY)
-    _brick(scene, (0.2, 0, -0.14), 4, 4, 0.07, YELLOW)
-    _brick(scene, (-0.35, 0, 0.02), 4, 5, 0.05, YELLOW, studs=False)
-    _brick(scene, (-0.72, 0, -0.2), 2, 3, 0.08, DARK)
+    _brick(scene, (-0.1, 0, -0.26), (8, 5, 0.05), YELLOW, studs=False)
+    _brick(scene, (-0.3, 0, -0.16), (5, 5, 0.05), GRAY)
+    _brick(scene, (0.2, 0, -0.14), (4, 4, 0.07), YELLOW)
+    _brick(scene, (-0.35, 0, 0.02), (4, 5, 0.05), YELLOW, studs=False)
+    _brick(scene, (-0.72, 0, -0.2), (2, 3, 0.08), DARK)
     for y in (-0.12, 0.12):
         scene.tube((0.2, y, -0.05), (0.2, y, 0.2), 0.035, DARK)
 
@@ -79,7 +70,7 @@ def _cab(scene: SceneBuilder) -> None:
         for y in (-0.22, 0.22):
             scene.tube((x, y, 0.06), (x, y, 0.42), 0.02, DARK)
     scene.box((-0.35, 0, 0.22), (0.16, 0.2, 0.13), GLASS)
-    _brick(scene, (-0.35, 0, 0.46), 5, 6, 0.04, YELLOW)
+    _brick(scene, (-0.35, 0, 0.46), (5, 6, 0.04), YELLOW)
     scene.tube((-0.5, -0.15, 0.5), (-0.5, -0.15, 0.68), 0.025, RED)
     scene.sphere((-0.5, -0.15, 0.7), 0.035, GLASS)
 

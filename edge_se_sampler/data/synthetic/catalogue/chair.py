@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edge_se_sampler.data.synthetic.linear import rotation, vector
+from edge_se_sampler.data.synthetic.linear import rotation
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
 WOOD = Material((0.33, 0.17, 0.07), (0.20, 0.09, 0.035), Pattern.WOOD, 3.0, roughness=0.4)
@@ -29,10 +29,10 @@ def _seat_and_legs(scene: SceneBuilder) -> None:
 def _frame(scene: SceneBuilder) -> None:
     for x in (-0.5, 0.5):
         post = [(x, 0.47, -0.12), (x, 0.55, 0.4), (0.95 * x, 0.66, 0.95)]
-        scene.polyline([vector(p) for p in post], 0.045, WOOD)
+        scene.polyline(post, 0.045, WOOD)
         scene.sphere((0.95 * x, 0.66, 1.0), 0.06, GOLD)
         arm = [(x, -0.42, -0.1), (1.08 * x, -0.44, 0.22), (1.08 * x, 0, 0.28), (x, 0.53, 0.3)]
-        scene.polyline([vector(p) for p in arm], 0.035, WOOD)
+        scene.polyline(arm, 0.035, WOOD)
         scene.sphere((1.08 * x, -0.46, 0.23), 0.06, WOOD)
 
 

@@ -6,8 +6,7 @@ import math
 
 from numpy.typing import ArrayLike
 
-from edge_se_sampler.data.synthetic.catalogue.shapes import around, ring
-from edge_se_sampler.data.synthetic.linear import Array, apply, rotation, vector
+from edge_se_sampler.data.synthetic.linear import Array, apply, around, ring, rotation, vector
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
 SHELL = Material((0.5, 0.03, 0.04), reflectance=0.06, roughness=0.15)

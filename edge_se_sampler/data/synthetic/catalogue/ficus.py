@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_se_sampler.data.synthetic.catalogue.shapes import around, spaced
-from edge_se_sampler.data.synthetic.linear import Array, cross, dot, unit, vector
+from edge_se_sampler.data.synthetic.linear import Array, around, cross, dot, spaced, unit, vector
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
 POT = Material((0.45, 0.20, 0.12), (0.60, 0.32, 0.2), Pattern.BLOTCHES, 9.0, roughness=0.7)

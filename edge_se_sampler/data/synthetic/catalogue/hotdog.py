@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from edge_se_sampler.data.synthetic.catalogue.shapes import ring, spaced
-from edge_se_sampler.data.synthetic.linear import Array, apply, compose, rotation, vector
+from edge_se_sampler.data.synthetic.linear import Array, apply, compose, ring, rotation, spaced, vector
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
 PLATE = Material((0.50, 0.50, 0.53), (0.40, 0.41, 0.45), Pattern.BLOTCHES, 8.0, reflectance=0.05, roughness=0.25)

@@ -6,8 +6,7 @@ import math
 
 from numpy.typing import ArrayLike
 
-from edge_se_sampler.data.synthetic.catalogue.shapes import around, ring, spaced
-from edge_se_sampler.data.synthetic.linear import Array, apply, rotation, vector
+from edge_se_sampler.data.synthetic.linear import Array, apply, around, ring, rotation, spaced, vector
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
 STEEL = Material((0.62, 0.62, 0.64), roughness=0.22, metalness=1.0)
