@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from edge_se_sampler.data.synthetic.linear import Array, compose, cross, unit, vector
+from edge_se_sampler.data.synthetic.linear import Array, around, compose, cross, unit, vector
 from edge_se_sampler.errors import InputError
 
 FIELD_OF_VIEW = 0.6911112070083618  # radians, as in NeRF's Blender scenes
@@ -63,20 +63,15 @@ class Framing:
     @property
     def principal(self) -> tuple[float, float]:
         """(cx, cy)."""
-        middle = self.size / 2
-        if self.placement == "shifted":
-            return middle + self.shift[0], middle + self.shift[1]
-        return middle, middle
+        x, y = self.shift if self.placement == "shifted" else (0, 0)
+        return self.size / 2 + x, self.size / 2 + y
 
     @property
     def intrinsics(self) -> dict[str, float]:
         """What the json says of the camera; a Blender loader assumes a principal point in the middle."""
-        if self.placement == "centered":
-            return {"camera_angle_x": FIELD_OF_VIEW}
-        intrinsics = {"camera_angle_x": 2 * math.atan(self.size / (2 * self.focal))}
-        if self.placement == "shifted":
-            intrinsics["cx"], intrinsics["cy"] = self.principal
-        return intrinsics
+        angle = FIELD_OF_VIEW if self.placement == "centered" else 2 * math.atan(self.size / (2 * self.focal))
+        center = {"cx": self.principal[0], "cy": self.principal[1]} if self.placement == "shifted" else {}
+        return {"camera_angle_x": angle} | center
 
     def camera(self, pose: Array) -> Camera:
         """The view from `pose` (4, 4), which looks at the origin; "rotated" rotates it in place."""
@@ -88,21 +83,23 @@ class Framing:
 def framing(size: int, placement: Placement = "centered", offset: tuple[float, float] = (0.0, 0.0)) -> Framing:
     """Places the object `offset` (right, down; fractions of the image's side) from the middle of size x size pixels.
 
-    "centered" ignores the offset; "padded" only makes room for it; "shifted" moves the principal point, "rotated"
-    rotates the cameras.
+    "centered" ignores the offset. "shifted" shows the centered picture of a smaller frame, pasted whole pixels away,
+    by moving the principal point; "padded" pastes it in the middle, so that only the position differs. "rotated" rotates
+    the cameras until the world's origin is at the shifted pixel; perspective then stretches the object.
 
-    Raises InputError if `size` is below 8, the placement is unknown, or the offset leaves the object a frame of
-    fewer than 8 pixels.
+    Raises:
+        InputError: `size` below 8, an unknown placement, or an offset that leaves the object a frame of fewer than 8
+            pixels.
     """
     if size < MIN_FRAME:
         raise InputError(f"size is {size} pixels: give at least {MIN_FRAME}")
     if placement not in get_args(Placement):
         raise InputError(f"placement is {placement!r}: give one of {', '.join(get_args(Placement))}")
-    shift = (0, 0)
-    if placement != "centered":
-        if not all(math.isfinite(fraction) for fraction in offset):
-            raise InputError(f"offset is {tuple(offset)}: give two finite numbers, fractions of the image's side")
-        shift = (round(offset[0] * size), round(offset[1] * size))
+    if placement == "centered":
+        offset = (0.0, 0.0)
+    if not all(math.isfinite(fraction) for fraction in offset):
+        raise InputError(f"offset is {tuple(offset)}: give two finite numbers, fractions of the image's side")
+    shift = (round(offset[0] * size), round(offset[1] * size))
     frame = size - 2 * max(abs(shift[0]), abs(shift[1]))
     if frame < MIN_FRAME:
         raise InputError(
@@ -120,24 +117,18 @@ def poses(split: Split, count: int, seed: int = 0) -> list[Array]:
     """
     if split == "test":
         revolutions = [index / _GOLDEN_RATIO % 1 for index in range(count)]
-        elevations = [math.radians(30 + 15 * math.sin(4 * math.pi * revolution)) for revolution in revolutions]
+        angles = [
+            (revolution, math.radians(30 + 15 * math.sin(4 * math.pi * revolution))) for revolution in revolutions
+        ]
     else:
         drawn = np.random.RandomState(seed + _SEED_OFFSET[split]).rand(count, 2).tolist()
-        revolutions = [first for first, _ in drawn]
         # Short of the horizon, and of the pole, where "up" has no direction in the image.
-        elevations = [math.asin(0.02 + 0.96 * second) for _, second in drawn]
-    pairs = zip(revolutions, elevations, strict=True)
-    return [_look_at_origin(2 * math.pi * revolution, elevation) for revolution, elevation in pairs]
+        angles = [(revolution, math.asin(0.02 + 0.96 * height)) for revolution, height in drawn]
+    return [_look_at_origin(2 * math.pi * revolution, elevation) for revolution, elevation in angles]
 
 
 def _look_at_origin(azimuth: float, elevation: float) -> Array:
-    back = vector(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ]
-    )
+    back = around(math.cos(elevation), azimuth, math.sin(elevation))
     right = unit(cross(vector([0, 0, 1]), back))
     return _pose(np.stack([right, cross(back, right), back], axis=1), DISTANCE * back)
 
@@ -146,13 +137,8 @@ def _rotated_toward(pose: Array, toward: Array) -> Array:
     """`pose` rotated in place, by the smallest angle, until it sees along `toward` what it saw along -z."""
     x, y, z = unit(toward)
     k = 1 / (1 - z)
-    to_axis = vector(  # the smallest rotation that takes `toward` to -z
-        [
-            [1 - k * x * x, -k * x * y, x],
-            [-k * x * y, 1 - k * y * y, y],
-            [-x, -y, -z],
-        ]
-    )
+    # the smallest rotation that takes `toward` to -z
+    to_axis = vector([[1 - k * x * x, -k * x * y, x], [-k * x * y, 1 - k * y * y, y], [-x, -y, -z]])
     return _pose(compose(pose[:3, :3], to_axis), pose[:3, 3])
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -23,8 +23,6 @@ from edge_se_sampler.errors import InputError
 
 _MIN_VIEWS_PER_PROCESS = 5  # starting a process takes as long as rendering a few
 _MAX_PROCESSES = 61  # Windows waits for no more
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ def make_scenes(
     placement: Placement = "centered",
     offset: tuple[float, float] = (0.2, 0.15),
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
     """Renders scenes into out/<name>, folders that any loader of NeRF's Blender scenes reads; returns their paths.
 
@@ -58,10 +56,7 @@ def make_scenes(
 
     Args:
         names: from SCENE_NAMES.
-        placement: where the object is seen. "centered" ignores the offset; "shifted" shows the centered picture of a
-            smaller frame, pasted whole pixels away, and states `cx` and `cy` (pixels) in the json; "padded" pastes that
-            picture in the middle, so that only the position differs; "rotated" rotates the cameras until the world's
-            origin is at the same pixel, which every loader reads, but perspective stretches the object.
+        placement: where the object is seen, see `framing`; for "shifted" the json states `cx` and `cy` (pixels).
         offset: of the object from the middle: right, down, as fractions of `size`.
         seed: 0 to 2**31 - 1; draws the cameras of train and val. Those of test are fixed.
         progress: called as progress(done, total), in views. More than a few views render in os.cpu_count() fresh
@@ -73,30 +68,25 @@ def make_scenes(
             empty; while rendering, an object that reaches the edge of a rotated camera's image.
     """
     counts: dict[Split, int] = {"train": num_train, "val": num_val, "test": num_test}
-    _check_names(names)
-    _check_numbers(counts, seed)
+    _check_arguments(names, counts, seed)
     frame = framing(size, placement, offset)
     targets = [Path(out) / name for name in names]
-
     cameras: dict[Split, list[Camera]] = {
         split: [frame.camera(pose) for pose in poses(split, count, seed)] for split, count in counts.items()
     }
     with staged_folders(Path(out), targets) as workspace:
         views = [view for name in names for view in _lay_out(workspace, name, frame, cameras)]
-        _render_all(views, workspace, progress or (lambda done, total: None))
+        _render_all(views, workspace, progress)
     return targets
 
 
-def _check_names(names: Sequence[str]) -> None:
+def _check_arguments(names: Sequence[str], counts: Mapping[Split, int], seed: int) -> None:
     if not names:
         raise InputError(f"names is empty: give at least one of {', '.join(SCENE_NAMES)}")
     for name in names:
         check_name(name)
     if len(set(names)) < len(names):
         raise InputError(f"names has a scene twice ({', '.join(names)}): give each once")
-
-
-def _check_numbers(counts: Mapping[Split, int], seed: int) -> None:
     for split, count in counts.items():
         minimum = 1 if split == "train" else 0
         if count < minimum:
@@ -128,30 +118,25 @@ def _lay_out(workspace: Path, name: str, frame: Framing, cameras: Mapping[Split,
     return views
 
 
-def _render_all(views: Sequence[_View], workspace: Path, progress: Progress) -> None:
+def _render_all(views: Sequence[_View], workspace: Path, progress: Callable[[int, int], None]) -> None:
     """Renders every view into its file, in this process if they are few, else in as many as there are CPUs."""
     processes = min(os.cpu_count() or 1, math.ceil(len(views) / _MIN_VIEWS_PER_PROCESS), _MAX_PROCESSES)
-    pool = None
-    try:
-        if processes == 1:
-            pictures = map(_render_png, views)
-        else:
-            context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_ignore_interrupts)
+    with ExitStack() as stack:
+        pictures = map(_render_png, views)
+        if processes > 1:
+            pool = ProcessPoolExecutor(processes, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN))
+            stack.callback(pool.shutdown, cancel_futures=True)
             with _interrupts_blocked():
                 pictures = pool.map(_render_png, views)
         for done, (view, png) in enumerate(zip(views, pictures, strict=True), start=1):
             (workspace / view.scene / f"{view.file}.png").write_bytes(png)
             progress(done, len(views))
-    finally:
-        if pool:
-            pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
     """Delays Ctrl-C until the end, and blocks it for good in processes started meanwhile: their parent stops them."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows: `_ignore_interrupts` alone must do
+    if not hasattr(signal, "pthread_sigmask"):  # Windows: that they ignore it once started must do
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -161,16 +146,11 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _ignore_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _render_png(view: _View) -> bytes:
     """The PNG file of one view."""
     picture = render(synthetic_scene(view.scene), view.camera)
     border = (picture[0], picture[-1], picture[:, 0], picture[:, -1])
     if view.may_clip and any(pixels[:, 3].any() for pixels in border):
-        raise InputError(
-            f"offset rotates {view.scene} to the edge of the image in view {view.file}: give one nearer to zero"
-        )
+        problem = f"offset rotates {view.scene} to the edge of the image in view {view.file}"
+        raise InputError(f"{problem}: give one nearer to zero")
     return imageio.imwrite("<bytes>", picture, extension=".png")

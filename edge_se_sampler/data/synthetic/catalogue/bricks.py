@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from itertools import product
 
-from numpy.typing import ArrayLike
-
 from edge_se_sampler.data.synthetic.linear import rotation, spaced, vector
 from edge_se_sampler.data.synthetic.scene import Material, Pattern, SceneBuilder
 
@@ -20,6 +18,8 @@ WARNING = Material((0.85, 0.52, 0.03), (0.04, 0.04, 0.04), Pattern.STRIPES, 5.0,
 
 STUD = 0.1  # distance between studs
 
+Point = tuple[float, float, float]
+
 
 def bricks(scene: SceneBuilder) -> None:
     _brick(scene, (0, 0, -0.62), (18, 12, 0.02), GREEN)
@@ -31,13 +31,13 @@ def bricks(scene: SceneBuilder) -> None:
 
 
 def _brick(
-    scene: SceneBuilder, center: ArrayLike, size: tuple[int, int, float], material: Material, studs: bool = True
+    scene: SceneBuilder, center: Point, size: tuple[int, int, float], material: Material, studs: bool = True
 ) -> None:
     """A brick of so many studs across and deep, and of a half height, with a hair's gap to its neighbours."""
     across, deep, half_height = size
     scene.box(center, (across * STUD / 2 - 0.002, deep * STUD / 2 - 0.002, half_height), material)
     for i, j in product(range(across), range(deep)) if studs else ():
-        foot = center + vector([(i - (across - 1) / 2) * STUD, (j - (deep - 1) / 2) * STUD, half_height])
+        foot = vector(center) + vector([(i - (across - 1) / 2) * STUD, (j - (deep - 1) / 2) * STUD, half_height])
         scene.tube(foot, foot + vector([0, 0, 0.028]), 0.031, material)
 
 
