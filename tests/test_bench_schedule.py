@@ -20,10 +20,10 @@ from edge_se_sampler.bench.schedule.trials import (
     SHARES,
     Settings,
     Trial,
-    best_shares,
     build_config,
     list_failure_trials,
     list_length_trials,
+    score_shares,
     selection_seeds,
 )
 
@@ -73,7 +73,7 @@ def test_the_best_share_is_trained_beside_the_adaptive_schedule_on_other_seeds()
     assert {(trial.iterations, trial.arm) for trial in later} == {(300, "0.2"), (300, "adaptive")}
     assert len(later) == 3 * len(SCENES_OF_LENGTHS) * 2
     assert {trial.seed for trial in later} == {0, 1, 2}
-    assert best_shares(runs[1:]) == {}  # one is still missing
+    assert score_shares(runs[1:]) == {}  # one is still missing
 
 
 def test_arms_differ_in_the_schedule_alone() -> None:
@@ -133,7 +133,7 @@ def test_the_command_trains_in_stages_what_is_pending(
     runs = json.loads((out / "result.json").read_text())["runs"]
     assert len(runs) == 4 + (2 + 1) * len(SHARES) + 2 * 2
     reported = {run["arm"] for run in runs if run["part"] == "lengths" and run["seed"] == 0}
-    assert reported == {"adaptive", *best_shares(runs).values()}
+    assert reported == {"adaptive", *(row.best for row in compare_lengths(runs))}
     assert (out / "lengths.png").stat().st_size > 0
     assert describe(out) == (out / "README.md").read_text()
     assert "Of 2 pairs Random failed in " in describe(out)

@@ -25,6 +25,13 @@ def require_pyplot():
     return pyplot
 
 
+def style_axes(*axes) -> None:
+    """A light grid, and no frame above and to the right."""
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+
+
 def save_figure(figure, path: Path) -> None:
     """Write a figure as PNG and close it.
 

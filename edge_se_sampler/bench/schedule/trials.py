@@ -63,18 +63,13 @@ def list_failure_trials(settings: Settings, seeds: Sequence[int]) -> list[Trial]
 def list_length_trials(runs: list[Run], seeds: Sequence[int]) -> list[Trial]:
     """Every fixed share of every planned length on the seeds of selection; where all of those have been trained, the
     best share and the adaptive schedule, paired, on the seeds that are reported."""
-    trials = []
+    trials, scores = [], score_shares(runs)
     for length in LENGTHS:
-        trials += _list_length_trials(length, SHARES, selection_seeds(length))
-        best = best_shares(runs).get(length)
-        if best is not None:
-            trials += _list_length_trials(length, (best, "adaptive"), seeds)
+        every: list[Any] = [*product(selection_seeds(length), SCENES_OF_LENGTHS, SHARES)]
+        if length in scores:
+            every += product(seeds, SCENES_OF_LENGTHS, (best_share(scores[length]), "adaptive"))
+        trials += [Trial("lengths", table, scene, length, arm, seed) for seed, (table, scene), arm in every]
     return trials
-
-
-def _list_length_trials(length: int, arms: Sequence[str], seeds: Sequence[int]) -> list[Trial]:
-    every = product(seeds, SCENES_OF_LENGTHS, arms)
-    return [Trial("lengths", table, scene, length, arm, seed) for seed, (table, scene), arm in every]
 
 
 def selection_seeds(length: int) -> tuple[int, ...]:
@@ -82,24 +77,29 @@ def selection_seeds(length: int) -> tuple[int, ...]:
     return (100, 101) if length < LENGTHS[-1] else (100,)
 
 
+def psnrs_by_trial(runs: list[Run], length: int) -> dict[tuple[str, int, str, int], float]:
+    """(arm, table, scene, seed) -> PSNR of the runs of a planned length."""
+    return {
+        (run["arm"], run["table"], run["scene"], run["seed"]): run["psnr"]
+        for run in runs
+        if (run["part"], run["iterations"]) == ("lengths", length)
+    }
+
+
 def score_shares(runs: list[Run]) -> dict[int, dict[str, float]]:
     """Planned length -> fixed share -> mean PSNR on the seeds of selection; only lengths of which all are trained."""
     scores = {}
     for length in LENGTHS:
         keys = [(table, scene, seed) for seed in selection_seeds(length) for table, scene in SCENES_OF_LENGTHS]
-        psnrs = {
-            (run["arm"], run["table"], run["scene"], run["seed"]): run["psnr"]
-            for run in runs
-            if run["part"] == "lengths" and run["iterations"] == length
-        }
+        psnrs = psnrs_by_trial(runs, length)
         if all((share, *key) in psnrs for share in SHARES for key in keys):
             scores[length] = {share: statistics.mean(psnrs[(share, *key)] for key in keys) for share in SHARES}
     return scores
 
 
-def best_shares(runs: list[Run]) -> dict[int, str]:
-    """Planned length -> the fixed share with the highest PSNR on the seeds of selection."""
-    return {length: max(scores, key=scores.__getitem__) for length, scores in score_shares(runs).items()}
+def best_share(scores: dict[str, float]) -> str:
+    """The fixed share with the highest score."""
+    return max(scores, key=scores.__getitem__)
 
 
 def build_config(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
