@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,14 +35,22 @@ def to_pictures(views: Views) -> list[Picture]:
     return [Picture(name, unit_float(views.images[i]), views.cameras[[i]]) for i, name in enumerate(views.names)]
 
 
-def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
-    """One of the model's outputs for all rays, on the CPU, without gradients and in evaluation mode."""
+@torch.no_grad()
+def render_outputs(model: RayModel, rays: RayBundle, keys: Collection[str]) -> dict[str, torch.Tensor]:
+    """Some of the model's outputs for all rays, on the CPU, without gradients and in evaluation mode."""
     was_training = model.training
     model.eval()
-    with torch.no_grad():
-        rendered = [model(rays[rows])[key].cpu() for rows in model.chunks(len(rays))]
+    chunks = []
+    for rows in model.chunks(len(rays)):
+        outputs = model(rays[rows])
+        chunks.append({key: outputs[key].cpu() for key in keys})
     model.train(was_training)
-    return torch.cat(rendered)
+    return {key: torch.cat([chunk[key] for chunk in chunks]) for key in keys}
+
+
+def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
+    """One of the model's outputs, as `render_outputs`."""
+    return render_outputs(model, rays, [key])[key]
 
 
 def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:

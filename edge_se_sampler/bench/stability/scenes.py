@@ -13,7 +13,7 @@ from torch import Tensor
 from edge_se_sampler.bench.stability.settings import Background
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.synthetic import Camera, render, synthetic_scene
-from edge_se_sampler.data.synthetic.cameras import poses
+from edge_se_sampler.data.synthetic.cameras import Split, poses
 from edge_se_sampler.data.views import Views
 
 SCENE = "materials"
@@ -38,26 +38,24 @@ def render_splits(foreground: float, shifted: bool, num_train: int) -> tuple[Vie
         foreground: share of the pixels that show the object (any alpha), a mean over the training views.
         shifted: whether the object is off centre.
     """
-    focal = _find_focal(foreground, SIZE, num_train)
+    focal = _find_focal(foreground, num_train)
     return _render("train", focal, shifted, num_train), _render("test", focal, shifted, NUM_TEST)
 
 
 @lru_cache(maxsize=16)
-def _find_focal(foreground: float, start: float, num_train: int, steps: int = 3) -> float:
+def _find_focal(foreground: float, num_train: int) -> float:
     """Focal length in pixels at which the object covers that share; the share grows with its square, nearly."""
-    focal = start
-    for _ in range(steps):
+    focal = float(SIZE)
+    for _ in range(3):
         images = _render("train", focal, False, min(num_train, 8)).images
         covered = np.mean([(image[..., 3] > 0).mean() for image in images])
         focal *= math.sqrt(foreground / float(covered))
     return focal
 
 
-def _render(split: str, focal: float, shifted: bool, count: int) -> Views:
-    dx, dy = SHIFT if shifted else (0, 0)
-    cx, cy = SIZE / 2 + dx, SIZE / 2 + dy
-    matrices = poses("test" if split == "test" else "train", count)
-    scene = synthetic_scene(SCENE)
+def _render(split: Split, focal: float, shifted: bool, count: int) -> Views:
+    cx, cy = (SIZE / 2 + (shift if shifted else 0) for shift in SHIFT)
+    matrices, scene = poses(split, count), synthetic_scene(SCENE)
     images = tuple(render(scene, Camera(pose, focal, (cx, cy), SIZE, SIZE)) for pose in matrices)
     cameras = Cameras.of(matrices, fx=focal, fy=focal, cx=cx, cy=cy, width=SIZE, height=SIZE)
     return Views(tuple(f"{split}/r_{i}" for i in range(count)), images, None, cameras)

@@ -1,12 +1,11 @@
-"""The robustness sweep: a base setting, every axis varied alone, and the pairs that matter; and the strategies that are
-trained in each setting.
-"""
+"""The robustness sweep: a base setting, every axis varied alone, the pairs that matter, and the strategies trained."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, Literal
 
 from edge_se_sampler.bench.overrides import SAMPLER
@@ -25,13 +24,11 @@ class Strategy:
     """Dotted path -> value, of the method's config (`override`)."""
 
 
-REINIT = {"reinit_dead": True}
+REINIT, ADAPTIVE = {"reinit_dead": True}, {f"{SAMPLER}.schedule": "adaptive"}
 STRATEGIES = {
     **{method: Strategy(label, method) for method, label in LABELS.items()},
     "reinit": Strategy("Random, reinitialised", "vanilla-nerf", REINIT),
-    "adaptive": Strategy(
-        "Edge + SE, adaptive, reinitialised", "edge-se-nerf", REINIT | {f"{SAMPLER}.schedule": "adaptive"}
-    ),
+    "adaptive": Strategy("Edge + SE, adaptive, reinitialised", "edge-se-nerf", {**REINIT, **ADAPTIVE}),
 }
 """The paper's six; and two that give new weights to networks that have died."""
 
@@ -54,29 +51,18 @@ class Setting:
     """Factor of the learning rate."""
 
 
-WORDS = {
-    "foreground": "object {:.0%}",
-    "placement": "off centre",
-    "num_views": "{} views",
-    "background": "{} background",
-    "density_activation": "{} density",
-    "initialization": "{} initialisation",
-    "density_noise": "density noise {:g}",
-    "depth": "{} layers",
-    "lr_scale": "learning rate x{:g}",
+AXES: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "foreground": ("object {:.0%}", (0.01, 0.02, 0.10, 0.30)),
+    "placement": ("off centre", ("shifted",)),
+    "num_views": ("{} views", (10,)),
+    "background": ("{} background", ("black", "grey", "green", "random", "textured")),
+    "density_activation": ("{} density", ("softplus",)),
+    "initialization": ("{} initialisation", ("torch",)),
+    "density_noise": ("density noise {:g}", (1.0,)),
+    "depth": ("{} layers", (8,)),
+    "lr_scale": ("learning rate x{:g}", (3.0,)),
 }
-AXES: dict[str, tuple[Any, ...]] = {
-    "foreground": (0.01, 0.02, 0.10, 0.30),
-    "placement": ("shifted",),
-    "num_views": (10,),
-    "background": ("black", "grey", "green", "random", "textured"),
-    "density_activation": ("softplus",),
-    "initialization": ("torch",),
-    "density_noise": (1.0,),
-    "depth": (8,),
-    "lr_scale": (3.0,),
-}
-"""The values of each axis besides the base setting's."""
+"""Field of `Setting` -> its label in words, and its values besides the base setting's."""
 PAIRS: tuple[dict[str, Any], ...] = (
     {"foreground": 0.01, "placement": "shifted"},
     {"foreground": 0.02, "placement": "shifted"},
@@ -89,12 +75,11 @@ PAIRS: tuple[dict[str, Any], ...] = (
 """Small and off centre; off centre and few views; what PyTorch ports start with, and softplus, which may help them."""
 
 
-def _label(changes: dict[str, Any]) -> str:
-    return ", ".join(WORDS[axis].format(value) for axis, value in changes.items()) or "base"
-
-
-_CHANGES = [{}, *({axis: value} for axis, values in AXES.items() for value in values), *PAIRS]
-SETTINGS = {_label(changes): replace(Setting(), **changes) for changes in _CHANGES}
+_CHANGES = [{}, *({axis: value} for axis, (_, values) in AXES.items() for value in values), *PAIRS]
+SETTINGS = {
+    ", ".join(AXES[axis][0].format(value) for axis, value in changes.items()) or "base": Setting(**changes)
+    for changes in _CHANGES
+}
 """Label, which says what differs from the base setting -> setting."""
 
 
@@ -116,5 +101,4 @@ class Trial:
 
 def list_all_trials(settings: Iterable[str], strategies: Iterable[str], seeds: Iterable[int]) -> list[Trial]:
     """Every setting with every strategy, seed by seed, so that an unfinished sweep covers all of them."""
-    settings, strategies = tuple(settings), tuple(strategies)
-    return [Trial(setting, strategy, seed) for seed in seeds for setting in settings for strategy in strategies]
+    return [Trial(setting, strategy, seed) for seed, setting, strategy in product(seeds, settings, strategies)]

@@ -6,14 +6,12 @@ import contextlib
 import io
 import tempfile
 import time
-from collections import defaultdict
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from edge_se_sampler.bench.outcomes import Outcome, classify
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, override
@@ -23,7 +21,7 @@ from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
-from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
+from edge_se_sampler.engine.rendering import Picture, render_outputs, to_pictures
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import disable_malloc_trimming
@@ -36,6 +34,8 @@ FailureMode = Literal["underfit", "dead at the start", "emptied", "opaque backgr
 LEARNING_RATE = 3e-3
 NUM_EVALUATIONS = 10
 """Of a training, on its way."""
+MODEL_FIELDS = ("depth", "density_activation", "initialization", "density_noise")
+"""Fields of a `Setting` that are the model's."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,9 @@ class Rendered:
         return classify(self.psnr, self.background_psnr, self.share)
 
     def failure_mode(self, dead_at_start: bool) -> FailureMode | None:
-        """How the network failed, if it did.
-
-        Args:
-            dead_at_start: whether it had no density anywhere before the first step.
-        """
-        if self.outcome == "converged":
-            return None
-        if self.outcome == "underfit":
-            return "underfit"
+        """How the network failed, if it did; dead_at_start: it had no density anywhere before the first step."""
+        if self.outcome != "collapsed":
+            return "underfit" if self.outcome == "underfit" else None
         if dead_at_start:
             return "dead at the start"
         return "opaque background" if self.accumulation > 0.5 else "emptied"
@@ -106,16 +100,12 @@ def run_trial(trial: Trial, size: TrainingSize, views_folder: Path) -> dict[str,
     if modes["fine"] is not None:
         views_folder.mkdir(parents=True, exist_ok=True)
         write_atomically(views_folder / f"{trial.name}.png", png_bytes(panel(model, pictures[0])))
-    measures = {
-        f"{network}_{key}": round(value, 4)
-        for network, result in rendered.items()
-        for key, value in asdict(result).items()
-    }
+    measures = {network: asdict(result) for network, result in rendered.items()}
     return {
         "outcome": rendered["fine"].outcome,
         "failure_mode": modes["fine"],
         "coarse_failure_mode": modes["coarse"],
-        **measures,
+        **{f"{network}_{key}": round(value, 4) for network in measures for key, value in measures[network].items()},
         "dead_at_start": dead,
         "reinitialized": 0 if resets is None else resets.used_sub_seeds,
         "shares": shares,
@@ -139,16 +129,13 @@ def build_trainer(
         f"{MANAGER}.train_num_rays_per_batch": size.rays,
         f"{MODEL}.size": "tiny",
         f"{MODEL}.width": size.width,
-        f"{MODEL}.depth": setting.depth,
         f"{MODEL}.num_coarse_samples": size.samples,
         f"{MODEL}.num_importance_samples": size.samples,
-        f"{MODEL}.density_activation": setting.density_activation,
-        f"{MODEL}.initialization": setting.initialization,
-        f"{MODEL}.density_noise": setting.density_noise,
         f"{MODEL}.background_color": "random" if setting.background == "random" else "white",
+        **{f"{MODEL}.{name}": getattr(setting, name) for name in MODEL_FIELDS},
+        **STRATEGIES[strategy].changes,
     }
-    method = STRATEGIES[strategy]
-    config = resolve_config(override(method_configs()[method.method], changes | method.changes), train)
+    config = resolve_config(override(method_configs()[STRATEGIES[strategy].method], changes), train)
     color = COLORS.get(setting.background, COLORS["white"])
     datamanager = config.pipeline.datamanager.setup(views=train, device="cpu", background_color=color)
     pipeline = Pipeline(datamanager, build_model(config, "cpu"))
@@ -159,41 +146,27 @@ def build_trainer(
 def panel(model: NeRFModel, picture: Picture) -> np.ndarray:
     """A held-out view, what the fine network renders of it, and its opacity, side by side: (H, 3 W, 3) in [0, 1]."""
     height, width, channels = picture.image.shape
-    rays = picture.rays(model.device)
-    rendered, opacity, background = (
-        render_rays(model, rays, key) for key in ("rgb_fine", "accumulation_fine", "background")
-    )
-    truth = target_colors(torch.from_numpy(picture.image).reshape(-1, channels), background)
-    images = [image.expand(-1, 3).reshape(height, width, 3) for image in (truth, rendered, opacity)]
+    outputs = render_outputs(model, picture.rays(model.device), ("background", "rgb_fine", "accumulation_fine"))
+    truth = target_colors(torch.from_numpy(picture.image).reshape(-1, channels), outputs.pop("background"))
+    images = [image.expand(-1, 3).reshape(height, width, 3) for image in (truth, *outputs.values())]
     return torch.cat(images, dim=1).clamp(0, 1).numpy()
 
 
-@torch.no_grad()
 def render_networks(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict[str, Rendered]:
     """What the coarse and the fine network show of held-out views, measured on every stride-th pixel."""
-    was_training = model.training
-    model.eval()
-    columns: dict[str, list[Tensor]] = defaultdict(list)
-    for picture in pictures:
-        rays = picture.rays(model.device)[::stride]
-        pixels = torch.from_numpy(picture.image).reshape(-1, 4)[::stride]
-        for rows in model.chunks(len(rays)):
-            outputs, image = model(rays[rows]), pixels[rows]
-            contrast = target_colors(image, outputs["background"]) - outputs["background"]
-            columns["background_error"].append(contrast.square().sum(dim=1))
-            columns["hits"].append(image[:, 3] > 0)
-            for network in model.networks:
-                columns[f"{network}_error"].append(model.squared_error(outputs, image, network))
-                columns[f"{network}_accumulation"].append(outputs[f"accumulation_{network}"][:, 0])
-    model.train(was_training)
-    values = {name: torch.cat(parts) for name, parts in columns.items()}
-    hits, background_error = values["hits"], values["background_error"]
-    return {
-        network: Rendered(
-            share=float(values[f"{network}_error"][hits].sum() / background_error[hits].sum()),
-            psnr=psnr(float(values[f"{network}_error"].mean() / 3)),
+    keys = ["background", *(f"{output}_{network}" for network in model.networks for output in ("rgb", "accumulation"))]
+    views = [render_outputs(model, picture.rays(model.device)[::stride], keys) for picture in pictures]
+    outputs = {key: torch.cat([view[key] for view in views]) for key in keys}
+    image = torch.cat([torch.from_numpy(picture.image).reshape(-1, 4)[::stride] for picture in pictures])
+    hits, background = image[:, 3] > 0, outputs["background"]
+    background_error = (target_colors(image, background) - background).square().sum(dim=1)
+    rendered = {}
+    for network in model.networks:
+        error = model.squared_error(outputs, image, network)
+        rendered[network] = Rendered(
+            share=float(error[hits].sum() / background_error[hits].sum()),
+            psnr=psnr(float(error.mean() / 3)),
             background_psnr=psnr(float(background_error.mean() / 3)),
-            accumulation=float(values[f"{network}_accumulation"][~hits].mean()),
+            accumulation=float(outputs[f"accumulation_{network}"][~hits].mean()),
         )
-        for network in model.networks
-    }
+    return rendered
