@@ -16,19 +16,13 @@ if TYPE_CHECKING:
     from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels
     from edge_se_sampler.sampling.edges import edge_strength
     from edge_se_sampler.sampling.error_map import ErrorMap
+    from edge_se_sampler.sampling.parts import Distribution, PixelBatch, Selector, TrainingStep
     from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler, ImportantPixels
     from edge_se_sampler.sampling.random_streams import Stream, stream
     from edge_se_sampler.sampling.ranking import Selection, sample_by_rank
     from edge_se_sampler.sampling.schedule import AdaptiveSchedule, FixedSchedule
     from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-    from edge_se_sampler.sampling.strategies import (
-        DISTRIBUTIONS,
-        SELECTORS,
-        Distribution,
-        PixelBatch,
-        Selector,
-        TrainingStep,
-    )
+    from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, SELECTORS
 
 __version__ = "0.1.0"
 
@@ -45,7 +39,8 @@ _MODULES = {
         "sampling.ranking": ["Selection", "sample_by_rank"],
         "sampling.schedule": ["AdaptiveSchedule", "FixedSchedule"],
         "sampling.settings": ["EdgeSEPixelSamplerConfig"],
-        "sampling.strategies": ["DISTRIBUTIONS", "SELECTORS", "Distribution", "PixelBatch", "Selector", "TrainingStep"],
+        "sampling.parts": ["Distribution", "PixelBatch", "Selector", "TrainingStep"],
+        "sampling.strategies": ["DISTRIBUTIONS", "SELECTORS"],
     }.items()
     for name in names
 }

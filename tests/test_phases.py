@@ -11,14 +11,8 @@ from batches import batch_of, brightness, following
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import STRATEGIES
-from edge_se_sampler.sampling.strategies import (
-    DISTRIBUTIONS,
-    SELECTORS,
-    Distribution,
-    PixelBatch,
-    Selector,
-    TrainingStep,
-)
+from edge_se_sampler.sampling.parts import Distribution, PixelBatch, Selector, TrainingStep
+from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, SELECTORS
 
 
 def in_box(indices: torch.Tensor) -> bool:

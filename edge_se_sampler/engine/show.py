@@ -15,9 +15,10 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.distribution import PixelTable
 from edge_se_sampler.sampling.edges import luma, unit_float
 from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.parts import Distribution
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, Distribution
+from edge_se_sampler.sampling.strategies import DISTRIBUTIONS
 
 
 def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np.ndarray:

@@ -18,15 +18,9 @@ from torch import Tensor
 from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.sampling.edges import WHITE
 from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.parts import Distribution, PixelBatch, SamplerPart, TrainingStep
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule, FixedSchedule, Schedule
-from edge_se_sampler.sampling.strategies import (
-    Distribution,
-    PixelBatch,
-    SamplerPart,
-    TrainingStep,
-    Uniform,
-    build_strategies,
-)
+from edge_se_sampler.sampling.strategies import Uniform, build_strategies
 
 SquaredError = Callable[[dict[str, Any]], Tensor]
 """Candidate batch -> (m,) squared errors of the model's current (fine) colors, without gradients."""

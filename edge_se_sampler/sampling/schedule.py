@@ -17,7 +17,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from edge_se_sampler.sampling.background import PlainBackgrounds, summarize_errors
-from edge_se_sampler.sampling.strategies import Distribution, PixelBatch, SamplerPart, TrainingStep
+from edge_se_sampler.sampling.parts import Distribution, PixelBatch, SamplerPart, TrainingStep
 
 Phase = Literal["early", "late"]
 
