@@ -18,10 +18,6 @@ from edge_se_sampler.bench.train import train_and_measure
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.methods import method_configs
 
-Method = Literal["nerf", "info-nerf"]
-Placement = Literal["centered", "padded", "shifted"]
-FEW_VIEWS = 10
-"""InfoNeRF's number of training views."""
 LATE_SE = ("se-nerf", "precrop-se-nerf", "edge-se-nerf")
 
 
@@ -30,55 +26,47 @@ class Table:
     """What the trainings of a table have in common."""
 
     title: str
-    method: Method = "nerf"
-    placement: Placement = "centered"
+    method: Literal["nerf", "info-nerf"] = "nerf"
+    placement: Literal["centered", "padded", "shifted"] = "centered"
     strategies: tuple[str, ...] = tuple(LABELS)
-    few_views: bool = False
     steps: float = 1.0
     """Iterations, as a share of the settings'."""
-    model: dict[str, Any] = field(default_factory=dict)
-    """Settings of the model that differ from the paper's."""
-    sampler: dict[str, Any] = field(default_factory=dict)
-    """Settings of the sampler that differ."""
-    reinit_dead: bool = False
-    """Dead networks are reinitialized."""
+    changes: dict[str, Any] = field(default_factory=dict)
+    """What differs from the paper's NeRF with all views, as `override` takes it."""
 
 
 # The share of the iterations that costs SE as much time as all of them cost Random. A late step of SE scores twice the
 # rays without gradients: 5 units of work instead of 3; with InfoNeRF's rays of unseen poses, 8 instead of 6.
 EQUAL_TIME = {"nerf": 1 / (0.1 + 0.9 * 5 / 3), "info-nerf": 1 / (0.1 + 0.9 * 8 / 6)}
-TORCH_WEIGHTS = {"initialization": "torch"}
-SOFTPLUS = {"density_activation": "softplus"}
+RANDOM = ("vanilla-nerf",)
+FEW_VIEWS = {"num_views": 10}
+TORCH_WEIGHTS = {f"{MODEL}.initialization": "torch"}
+REINIT_DEAD = {**TORCH_WEIGHTS, "reinit_dead": True}
+SOFTPLUS = {f"{MODEL}.density_activation": "softplus"}
+LAPLACIAN = {f"{SAMPLER}.edge_filter": "laplacian"}
+
 PAPER_TABLES: dict[int, Table] = {
     1: Table("NeRF, all views, centred"),
     2: Table("NeRF, all views, off centre", placement="shifted"),
-    3: Table("InfoNeRF, 10 views, centred", "info-nerf", few_views=True),
-    4: Table("InfoNeRF, 10 views, off centre", "info-nerf", "shifted", few_views=True),
+    3: Table("InfoNeRF, 10 views, centred", "info-nerf", changes=FEW_VIEWS),
+    4: Table("InfoNeRF, 10 views, off centre", "info-nerf", "shifted", changes=FEW_VIEWS),
 }
-_RANDOM = ("vanilla-nerf",)
-TABLES: dict[int, Table] = PAPER_TABLES | {
-    5: Table("NeRF, 10 views, centred", few_views=True),
-    6: Table("NeRF, 10 views, off centre", placement="shifted", few_views=True),
-    7: Table("as 1, torch's initial weights", model=TORCH_WEIGHTS),
-    8: Table("as 2, torch's initial weights", placement="shifted", model=TORCH_WEIGHTS),
+TABLES: dict[int, Table] = {
+    **PAPER_TABLES,
+    5: Table("NeRF, 10 views, centred", changes=FEW_VIEWS),
+    6: Table("NeRF, 10 views, off centre", placement="shifted", changes=FEW_VIEWS),
+    7: Table("as 1, torch's initial weights", changes=TORCH_WEIGHTS),
+    8: Table("as 2, torch's initial weights", placement="shifted", changes=TORCH_WEIGHTS),
     **{
-        number + 8: replace(
-            table, title=f"as {number}, in Random's time", strategies=LATE_SE, steps=EQUAL_TIME[table.method]
-        )
-        for number, table in PAPER_TABLES.items()
+        n + 8: replace(table, title=f"as {n}, in Random's time", strategies=LATE_SE, steps=EQUAL_TIME[table.method])
+        for n, table in PAPER_TABLES.items()
     },
-    13: Table("as 1, Laplacian edges", strategies=("edge-nerf",), sampler={"edge_filter": "laplacian"}),
-    14: Table("as 1, softplus density", strategies=_RANDOM, model=SOFTPLUS),
-    15: Table("as 2, softplus density", placement="shifted", strategies=_RANDOM, model=SOFTPLUS),
+    13: Table("as 1, Laplacian edges", strategies=("edge-nerf",), changes=LAPLACIAN),
+    14: Table("as 1, softplus density", strategies=RANDOM, changes=SOFTPLUS),
+    15: Table("as 2, softplus density", "nerf", "shifted", RANDOM, changes=SOFTPLUS),
     16: Table("as 2, as small but centred", "nerf", "padded", ("vanilla-nerf", "precrop-nerf", "edge-nerf")),
-    17: Table("as 7, dead networks reinitialised", strategies=_RANDOM, model=TORCH_WEIGHTS, reinit_dead=True),
-    18: Table(
-        "as 8, dead networks reinitialised",
-        placement="shifted",
-        strategies=_RANDOM,
-        model=TORCH_WEIGHTS,
-        reinit_dead=True,
-    ),
+    17: Table("as 7, dead networks reinitialised", strategies=RANDOM, changes=REINIT_DEAD),
+    18: Table("as 8, dead networks reinitialised", "nerf", "shifted", RANDOM, changes=REINIT_DEAD),
 }
 """The paper's four, and ours."""
 
@@ -121,17 +109,22 @@ class Trial:
         return f"table-{self.table}-{self.scene}-{self.strategy}-{self.seed}"
 
 
+def runs_by_trial(runs: list[Run]) -> dict[Trial, Run]:
+    """Trial -> its run."""
+    return {Trial(run["table"], run["scene"], run["strategy"], run["seed"]): run for run in runs}
+
+
 def list_trials(
     tables: Sequence[int], scenes: Sequence[str], strategies: Sequence[str], seeds: Sequence[int]
 ) -> list[Trial]:
     """All chosen trainings (nothing chosen: all): the paper's seed by seed, then ours, so that an unfinished experiment
     is a smaller one."""
-    groups = (tuple(PAPER_TABLES), tuple(number for number in TABLES if number not in PAPER_TABLES))
+    chosen = tables or (*TABLES,)
+    groups = [[n for n in TABLES if n in chosen and (n in PAPER_TABLES) == papers] for papers in (True, False)]
     return [
         Trial(table, scene, strategy, seed)
         for group in groups
         for seed, table, scene in product(seeds, group, scenes or SCENES)
-        if not tables or table in tables
         for strategy in TABLES[table].strategies
         if not strategies or strategy in strategies
     ]
@@ -141,26 +134,24 @@ def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path)
     """What a trial trains: every sample of every ray, no empty space skipped, as the paper does."""
     table, methods = TABLES[trial.table], method_configs()
     strategy = methods[trial.strategy]
-    model = {"size": settings.size, **table.model}
-    if settings.samples is not None:
-        model["num_coarse_samples"], model["num_importance_samples"] = settings.samples
     iterations = round(table.steps * (settings.info_iterations if table.method == "info-nerf" else settings.iterations))
     changes = {
         "data": data,
         "output_dir": output_dir,
         "experiment_name": trial.name,
-        "num_views": FEW_VIEWS if table.few_views else None,
         "max_num_iterations": iterations,
         "steps_per_save": iterations,
         "steps_per_eval_image": iterations,
         "steps_per_log": max(1, iterations // 50),
-        "reinit_dead": table.reinit_dead,
         "machine": MachineConfig(seed=trial.seed, device_type="auto"),
         MANAGER: strategy.pipeline.datamanager,
         f"{MANAGER}.train_num_rays_per_batch": settings.rays,
-        **{f"{SAMPLER}.{name}": value for name, value in table.sampler.items()},
-        **{f"{MODEL}.{name}": value for name, value in model.items()},
+        f"{MODEL}.size": settings.size,
+        **table.changes,
     }
+    if settings.samples is not None:
+        names = (f"{MODEL}.num_coarse_samples", f"{MODEL}.num_importance_samples")
+        changes |= dict(zip(names, settings.samples, strict=True))
     return override(methods["info-nerf"] if table.method == "info-nerf" else strategy, changes)
 
 

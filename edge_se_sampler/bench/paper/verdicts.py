@@ -5,11 +5,13 @@ A comparison pairs runs of the same scene and seed. What a failure is, `bench.ou
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Literal
 
 from edge_se_sampler.bench.outcomes import failed
-from edge_se_sampler.bench.paper.trials import PAPER_TABLES
+from edge_se_sampler.bench.paper.trials import PAPER_TABLES, Trial, runs_by_trial
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.statistics import PairedDifference, paired_difference
 from edge_se_sampler.bench.strategies import LABELS
@@ -21,22 +23,31 @@ MIN_DIFFERENCE = 0.3
 
 RANDOM, SE, EDGE, EDGE_SE = "vanilla-nerf", "se-nerf", "edge-nerf", "edge-se-nerf"
 PRECROP, PRECROP_SE = "precrop-nerf", "precrop-se-nerf"
-WITH_SE = {RANDOM: SE, PRECROP: PRECROP_SE, EDGE: EDGE_SE}
+WITH_SE = {SE: RANDOM, PRECROP_SE: PRECROP, EDGE_SE: EDGE}
+EDGE_AGAINST_PRECROP = {EDGE: PRECROP, EDGE_SE: PRECROP_SE}
 
-Arm = tuple[int, str]  # table, strategy
 Kind = Literal["better", "not inferior", "prevents failures"]
 Verdict = Literal["supported", "not supported", "undecided", "nothing to compare"]
+PSNR, EDGE_BAND = "psnr", "edge_band_psnr"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """An arm against a baseline, or that difference minus the difference of a second such pair."""
+    """A strategy in a table against a baseline, or that difference minus the one in another table."""
 
-    label: str
-    arm: Arm
-    baseline: Arm
-    second_pair: tuple[Arm, ...] = ()
-    measure: str = "psnr"
+    arm: tuple[int, str]
+    """Table and strategy."""
+    baseline: tuple[int, str]
+    minus_table: int | None = None
+    measure: str = PSNR
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        strategies = " against ".join(dict.fromkeys(LABELS[strategy] for _, strategy in (self.arm, self.baseline)))
+        tables = " against ".join(dict.fromkeys(str(table) for table, _ in (self.arm, self.baseline)))
+        minus = "" if self.minus_table is None else f", minus that in table {self.minus_table}"
+        return f"{strategies}, table {tables}{minus}" + " (edge band)" * (self.measure == EDGE_BAND)
 
 
 @dataclass(frozen=True)
@@ -50,7 +61,7 @@ class Claim:
     text: str
     source: str
     kind: Kind
-    comparisons: tuple[Comparison, ...]
+    comparisons: Sequence[Comparison]
 
 
 @dataclass(frozen=True)
@@ -81,100 +92,90 @@ class ClaimVerdict:
         return next(verdict for verdict in ordered if verdict in verdicts)
 
 
-def _against(arm: str, baseline: str) -> str:
-    return f"{LABELS[arm]} against {LABELS[baseline]}"
+def _compare_in(tables: Iterable[int], pairs: dict[str, str], **options: Any) -> list[Comparison]:
+    """Every strategy against its baseline in every table."""
+    return [Comparison((n, s), (n, baseline), **options) for s, baseline in pairs.items() for n in tables]
 
 
-def _in_tables(tables: tuple[int, ...], arm: str, baseline: str, measure: str = "psnr") -> tuple[Comparison, ...]:
-    label, note = _against(arm, baseline), " (edge band)" if measure == "edge_band_psnr" else ""
-    return tuple(Comparison(f"{label}, table {n}{note}", (n, arm), (n, baseline), measure=measure) for n in tables)
-
-
-def _gain_of_few_views(table: int, arm: str, baseline: str) -> Comparison:
-    label = f"{_against(arm, baseline)}: table {table} against table 1"
-    return Comparison(label, (table, arm), (table, baseline), ((1, arm), (1, baseline)))
-
-
-def _random_with(what: str, table: int, baseline_table: int) -> Comparison:
-    label = f"Random with {what}, table {table} against {baseline_table}"
-    return Comparison(label, (table, RANDOM), (baseline_table, RANDOM))
+def _compare_tables(strategy: str, *tables: tuple[int, int]) -> list[Comparison]:
+    """A strategy in a table against itself in another."""
+    return [Comparison((table, strategy), (baseline, strategy)) for table, baseline in tables]
 
 
 CLAIMS = (
     Claim(
         "Where the object is centred, Edge is as stable as Precrop", "sections 4.2.1 and 4.3.1", "not inferior",
-        (*_in_tables((1, 3), EDGE, PRECROP), *_in_tables((1, 3), EDGE_SE, PRECROP_SE)),
+        _compare_in((1, 3), EDGE_AGAINST_PRECROP),
     ),
     Claim(
         "Off centre, Edge trains where Precrop fails", "sections 4.2.2 and 4.3.2", "prevents failures",
-        (*_in_tables((2, 4), EDGE, PRECROP), *_in_tables((2, 4), EDGE_SE, PRECROP_SE)),
+        _compare_in((2, 4), EDGE_AGAINST_PRECROP),
     ),
     Claim(
         "SE raises PSNR whatever the early phase, at equal steps", "section 4.2.1", "better",
-        tuple(row for early, late in WITH_SE.items() for row in _in_tables(tuple(PAPER_TABLES), late, early)),
+        _compare_in(PAPER_TABLES, WITH_SE),
     ),
     Claim(
         "SE raises PSNR whatever the early phase, at equal time", "ours", "better",
-        tuple(
-            Comparison(f"{_against(late, early)}, table {n + 8} against {n}", (n + 8, late), (n, early))
-            for early, late in WITH_SE.items()
-            for n in PAPER_TABLES
-        ),
+        [Comparison((n + 8, late), (n, early)) for late, early in WITH_SE.items() for n in PAPER_TABLES],
     ),
     Claim(
         "With few views, Edge gains more over Precrop", "section 4.3.1", "better",
-        tuple(_gain_of_few_views(table, EDGE, PRECROP) for table in (3, 5)),
+        _compare_in((3, 5), {EDGE: PRECROP}, minus_table=1),
     ),
     Claim(
         "With few views, SE gains more", "abstract", "better",
-        tuple(_gain_of_few_views(table, EDGE_SE, EDGE) for table in (3, 5)),
+        _compare_in((3, 5), {EDGE_SE: EDGE}, minus_table=1),
     ),
     Claim(
         "Sobel edges are better than Laplacian ones", "section 4.1.4", "better",
-        (Comparison("Sobel against Laplacian, table 1 against 13", (1, EDGE), (13, EDGE)),),
+        _compare_tables(EDGE, (1, 13)),
     ),
     Claim(
         "Edge regions get sharper with Edge than with Precrop", "section 5", "better",
-        _in_tables((1, 3), EDGE, PRECROP, measure="edge_band_psnr"),
+        _compare_in((1, 3), {EDGE: PRECROP}, measure=EDGE_BAND),
     ),
     Claim(
         "Precrop fails because of where the object is, not because it is small", "ours", "prevents failures",
-        (Comparison("Precrop, small and centred against off centre, table 16 against 2", (16, PRECROP), (2, PRECROP)),),
+        _compare_tables(PRECROP, (16, 2)),
     ),
     Claim(
         "A softplus density alone keeps Random from failing", "ours", "prevents failures",
-        tuple(_random_with("softplus against ReLU", *pair) for pair in ((14, 1), (15, 2))),
+        _compare_tables(RANDOM, (14, 1), (15, 2)),
     ),
     Claim(
         "Reinitialising dead networks keeps Random from failing", "ours", "prevents failures",
-        tuple(_random_with("dead networks reinitialised", *pair) for pair in ((17, 7), (18, 8))),
+        _compare_tables(RANDOM, (17, 7), (18, 8)),
     ),
 )  # fmt: skip
 
 
 def evaluate_claims(runs: list[Run]) -> list[ClaimVerdict]:
     """What the runs say of every claim for which there are pairs of runs."""
-    by_key = {(run["table"], run["strategy"], run["scene"], run["seed"]): run for run in runs}
+    by_trial = runs_by_trial(runs)
     verdicts = []
     for claim in CLAIMS:
-        rows = [row for comparison in claim.comparisons if (row := _compare(comparison, claim.kind, by_key))]
-        if rows:
-            verdicts.append(ClaimVerdict(claim, rows))
+        rows = [_compare(comparison, claim.kind, by_trial) for comparison in claim.comparisons]
+        if any(row.pairs for row in rows):
+            verdicts.append(ClaimVerdict(claim, [row for row in rows if row.pairs]))
     return verdicts
 
 
-def _compare(comparison: Comparison, kind: Kind, by_key: dict[Any, Run]) -> ComparedRuns | None:
-    arms = (comparison.arm, comparison.baseline, *comparison.second_pair)
-    scene_seeds = sorted((scene, seed) for (table, name, scene, seed) in by_key if (table, name) == comparison.arm)
-    groups = [[by_key[arm + scene_seed] for arm in arms if arm + scene_seed in by_key] for scene_seed in scene_seeds]
-    pairs = [runs for runs in groups if len(runs) == len(arms) and all(run[comparison.measure] for run in runs)]
-    if not pairs:
-        return None
+def _compare(comparison: Comparison, kind: Kind, by_trial: dict[Trial, Run]) -> ComparedRuns:
+    arms = [comparison.arm, comparison.baseline]
+    if comparison.minus_table is not None:
+        arms += [(comparison.minus_table, strategy) for _, strategy in arms]
+    pairs = []
+    for trial in sorted(by_trial, key=lambda trial: (trial.scene, trial.seed)):
+        if (trial.table, trial.strategy) == comparison.arm:
+            runs = [by_trial.get(Trial(table, trial.scene, strategy, trial.seed)) for table, strategy in arms]
+            if all(run is not None and run[comparison.measure] for run in runs):
+                pairs.append(runs)
     failures, baseline_failures = (sum(failed(runs[i]) for runs in pairs) for i in (0, 1))
     informative = [runs for runs in pairs if not _both_failed(runs)]
     difference = paired_difference((runs[0]["scene"], _difference(runs, comparison.measure)) for runs in informative)
     if kind == "prevents failures":
-        verdict = _prevented(pairs)
+        verdict = _judge_failures(pairs)
     elif not informative:
         verdict = "nothing to compare"
     else:
@@ -205,16 +206,11 @@ def _judge_interval(kind: Kind, difference: PairedDifference) -> Verdict:
     return "undecided"
 
 
-def _prevented(pairs: list[list[Run]]) -> Verdict:
+def _judge_failures(pairs: list[list[Run]]) -> Verdict:
     """On the scenes where most of the baseline's runs fail: does any of the arm's?"""
-    by_scene: dict[str, list[tuple[bool, bool]]] = {}
-    for run, baseline in pairs:
-        by_scene.setdefault(run["scene"], []).append((failed(run), failed(baseline)))
-    hard = [
-        outcomes
-        for outcomes in by_scene.values()
-        if len(outcomes) >= MIN_SEEDS and 2 * sum(baseline for _, baseline in outcomes) > len(outcomes)
-    ]
+    by_scene = groupby(pairs, lambda runs: runs[0]["scene"])
+    failures = [[(failed(run), failed(baseline)) for run, baseline, *_ in group] for _, group in by_scene]
+    hard = [f for f in failures if len(f) >= MIN_SEEDS and 2 * sum(baseline for _, baseline in f) > len(f)]
     if not hard:
         return "undecided"
     return "not supported" if any(arm for outcomes in hard for arm, _ in outcomes) else "supported"
