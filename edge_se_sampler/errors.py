@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -14,11 +15,7 @@ class InputError(ValueError):
 
 
 def check_known(flag: str, names: Sequence[object], known: Iterable[object]) -> None:
-    """Check that the names given to a flag are known ones.
-
-    Raises:
-        InputError: one is not.
-    """
+    """InputError if one of the names given to a flag is not a known one."""
     known = tuple(known)
     for name in names:
         if name not in known:
@@ -26,13 +23,15 @@ def check_known(flag: str, names: Sequence[object], known: Iterable[object]) -> 
 
 
 def check_value(flag: str, value: object, valid: bool, rule: str) -> None:
-    """Refuse a flag's value.
-
-    Args:
-        rule: what it must be, for the message.
-
-    Raises:
-        InputError: it is not valid.
-    """
+    """InputError if a flag's value is not valid; the rule says what it must be."""
     if not valid:
         raise InputError(f"--{flag} is {value}: must be {rule}")
+
+
+@contextmanager
+def os_errors_as_input_errors(failure: str) -> Iterator[None]:
+    """Turn an OSError into an InputError: what failed, as "FILE: cannot be written", and the system's reason."""
+    try:
+        yield
+    except OSError as problem:
+        raise InputError(f"{failure} ({problem.strerror or problem})") from problem

@@ -17,19 +17,14 @@ from typing import Any
 import torch
 
 from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 MAGIC = b"edge-se-checkpoint 2 "
 _NAME = re.compile(r"step-(\d{9,})\.ckpt")
 
 
-def checkpoint_path(folder: Path, step: int) -> Path:
-    """Path of the checkpoint that was written after a step (0, 1, ...)."""
-    return folder / f"step-{step:09d}.ckpt"
-
-
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
-    """Write a checkpoint, then delete the older ones.
+    """Write the checkpoint after a step (0, 1, ...), then delete the older ones.
 
     Raises:
         InputError: it cannot be written (disk full, no permission); older ones are untouched.
@@ -37,24 +32,20 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
-    path = checkpoint_path(folder, step)
+    path = folder / f"step-{step:09d}.ckpt"
     write_atomically(path, MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
-    for older in _checkpoints(folder):
-        if older != path and _step(older) < step:
-            older.unlink(missing_ok=True)
+    for other_step, other in _checkpoints(folder).items():
+        if other_step < step:
+            other.unlink(missing_ok=True)
     return path
 
 
 def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint with the highest step.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The checkpoint with the highest step; InputError if there is none."""
     found = _checkpoints(folder)
     if not found:
         raise InputError(f"{folder}: no checkpoint (step-*.ckpt); the run ended before its first was saved")
-    return max(found, key=_step)
+    return found[max(found)]
 
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
@@ -64,15 +55,11 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
         InputError: unreadable, truncated or changed since it was written, not a checkpoint, or saved under another
             configuration.
     """
-    try:
+    with os_errors_as_input_errors(f"{path}: cannot be read"):
         content = path.read_bytes()
-    except OSError as problem:
-        raise InputError(f"{path}: cannot be read ({problem.strerror})") from problem
     header, _, payload = content.partition(b"\n")
     if not header.startswith(MAGIC):
-        raise InputError(
-            f"{path}: not a checkpoint of this version of edge-se; point to a run folder that its edge-se train wrote"
-        )
+        raise InputError(f"{path}: not a checkpoint of this version of edge-se; use a run folder that it wrote")
     if header[len(MAGIC) :] != hashlib.sha256(payload).hexdigest().encode():
         raise InputError(f"{path}: truncated or changed since it was saved (checksum); restore it or train again")
     try:
@@ -84,11 +71,7 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     return state
 
 
-def _checkpoints(folder: Path) -> list[Path]:
-    return [path for path in folder.glob("step-*.ckpt") if _NAME.fullmatch(path.name)]
-
-
-def _step(path: Path) -> int:
-    match = _NAME.fullmatch(path.name)
-    assert match
-    return int(match.group(1))
+def _checkpoints(folder: Path) -> dict[int, Path]:
+    """Step -> checkpoint."""
+    matches = {path: _NAME.fullmatch(path.name) for path in folder.glob("step-*.ckpt")}
+    return {int(match[1]): path for path, match in matches.items() if match}

@@ -1,4 +1,7 @@
-"""Outputs: checked before the work, written completely or not at all."""
+"""Outputs: checked before the work, written completely or not at all.
+
+Every function that checks or writes a file or folder raises InputError if that cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -11,44 +14,32 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file's content and flush it to the disk; on failure leave the file as it was.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Replace a file's content and flush it to the disk; on failure leave the file as it was."""
     temporary = path.parent / f".{path.name}.tmp"
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+    with os_errors_as_input_errors(f"{path}: cannot be written, what was there before is untouched"):
+        try:
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
         with contextlib.suppress(PermissionError):  # a folder that cannot be opened cannot be flushed
             folder = os.open(path.parent, os.O_RDONLY)
             try:
                 os.fsync(folder)
             finally:
                 os.close(folder)
-    except OSError as problem:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        reason = problem.strerror or str(problem)
-        raise InputError(f"{path}: cannot be written ({reason}); what was there before is untouched") from problem
 
 
 def check_output(path: Path, flag: str = "--output-path") -> None:
-    """Check that a file can be written.
-
-    Args:
-        flag: of the command line, which named it.
-
-    Raises:
-        InputError: it names no file, is a folder, or its folder does not exist or cannot be written.
-    """
+    """Check that a file, named by a flag, can be written: its folder must exist."""
     if not path.name or path.is_dir():
         raise InputError(f"{flag} {path}: must name a file, not a folder")
     if not path.parent.is_dir():
@@ -57,49 +48,21 @@ def check_output(path: Path, flag: str = "--output-path") -> None:
         raise InputError(f"{flag} {path}: {path.parent} cannot be written")
 
 
-def prepare_output(path: Path, flag: str = "--output-path") -> None:
-    """Create the folder of a file, and check that the file can be written.
-
-    Raises:
-        InputError: as `make_folder` and `check_output`.
-    """
-    make_folder(path.parent, f"{flag}, folder")
-    check_output(path, flag)
-
-
 def make_folder(path: Path, flag: str) -> None:
-    """Create a folder that can be written.
-
-    Args:
-        flag: of the command line, which named it.
-
-    Raises:
-        InputError: it cannot be created or written.
-    """
-    try:
+    """Create a folder, named by a flag, unless it exists."""
+    with os_errors_as_input_errors(f"{flag} {path}: cannot be created"):
         path.mkdir(parents=True, exist_ok=True)
-        writable = os.access(path, os.W_OK)
-    except OSError as problem:
-        raise InputError(f"{flag} {path}: cannot be created ({problem.strerror or problem})") from problem
-    if not writable:
+    if not os.access(path, os.W_OK):
         raise InputError(f"{flag} {path}: cannot be written")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write valid json (a NaN is an error, not a token).
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write valid json; a NaN is a ValueError, not a token."""
     write_atomically(path, json.dumps(content, indent=1, allow_nan=False).encode() + b"\n")
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an (H, W, 3) float image in [0, 1] as PNG.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write an (H, W, 3) float image in [0, 1] as PNG."""
     write_atomically(path, png_bytes(image))
 
 

@@ -21,11 +21,7 @@ from edge_se_sampler.errors import InputError, check_value
 def render_run(
     run: RunFolder, config: TrainerConfig, output_path: Path, kind: str, num_frames: int, frames_per_second: int
 ) -> None:
-    """Render a run's last checkpoint along a spiral or at its held-out cameras, as a video.
-
-    Raises:
-        InputError: a bad run, or an output that cannot be written.
-    """
+    """Render a run's last checkpoint along a spiral or at its held-out cameras (kind "test"), as a video."""
     check_video(output_path, frames_per_second)
     check_value("num-frames", num_frames, num_frames >= 1, "at least 1")
     check_value("frames-per-second", frames_per_second, frames_per_second >= 1, "at least 1")
@@ -40,19 +36,13 @@ def render_run(
     cameras, frames = cameras.to(model.device, torch.float32), []
     with Progress(len(cameras), "rendering") as progress:
         for i in range(len(cameras)):
-            rendered = render_rays(model, cameras.image_rays(i))
-            frames.append(rendered.reshape(height, width, 3).numpy())
+            frames.append(render_rays(model, cameras.image_rays(i)).reshape(height, width, 3).numpy())
             progress.update(i + 1)
     write_video(output_path, frames, frames_per_second)
 
 
 def check_video(path: Path, frames_per_second: int) -> None:
-    """Check that `write_video` can write such a file.
-
-    Raises:
-        InputError: neither .gif nor .mp4, too fast for a GIF, the [video] extra is missing, or the file cannot be
-            written.
-    """
+    """InputError if `write_video` cannot write such a file."""
     if path.suffix.lower() == ".gif" and frames_per_second > 50:
         raise InputError(f"--frames-per-second is {frames_per_second}: a GIF has at most 50; use .mp4")
     if path.suffix.lower() not in (".gif", ".mp4"):
@@ -71,21 +61,12 @@ def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) ->
     Raises:
         InputError: it cannot be written.
     """
-    stacked = to_uint8(np.stack(frames))
-    if path.suffix.lower() == ".gif":
-        content = iio.imwrite(
-            "<bytes>", stacked, extension=".gif", duration=10 * round(100 / frames_per_second), loop=0
-        )
-        write_atomically(path, content)
-        return
-    if min(stacked.shape[1:3]) < 2:
-        raise InputError(f"{path}: the views are 1 pixel wide or high, which is no video")
-    even = stacked[:, : stacked.shape[1] // 2 * 2, : stacked.shape[2] // 2 * 2]  # the codec needs even sides
-    temporary = path.with_name(f".{path.stem}.tmp.mp4")
-    try:
-        iio.imwrite(temporary, even, fps=frames_per_second, macro_block_size=2)
-        temporary.replace(path)
-    except OSError as problem:
-        raise InputError(f"{path}: cannot be written ({problem.strerror or problem})") from problem
-    finally:
-        temporary.unlink(missing_ok=True)
+    stacked, suffix = to_uint8(np.stack(frames)), path.suffix.lower()
+    if suffix == ".gif":
+        settings = {"duration": 10 * round(100 / frames_per_second), "loop": 0}
+    else:
+        if min(stacked.shape[1:3]) < 2:
+            raise InputError(f"{path}: the views are 1 pixel wide or high, which is no video")
+        stacked = stacked[:, : stacked.shape[1] // 2 * 2, : stacked.shape[2] // 2 * 2]  # the codec needs even sides
+        settings = {"fps": frames_per_second, "macro_block_size": 2}
+    write_atomically(path, iio.imwrite("<bytes>", stacked, extension=suffix, **settings))

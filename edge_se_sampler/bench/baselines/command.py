@@ -30,14 +30,15 @@ class BenchBaselines(ChartOptions):
     def run(self) -> None:
         from edge_se_sampler.bench.baselines.results import BaselineSettings, path_of
         from edge_se_sampler.bench.baselines.run import run_baseline, version_of
-        from edge_se_sampler.engine.files import prepare_output
+        from edge_se_sampler.engine.files import check_output, make_folder
 
         settings = BaselineSettings(
             **vars(self.settings()), program=self.program, label=self.label, flags=self.flags,
             program_version=version_of(self.checkout),
         )  # fmt: skip
         path = path_of(settings, self.output_dir)
-        prepare_output(path, "--output-dir")
+        make_folder(path.parent, "--output-dir")
+        check_output(path, "--output-dir")
         scenes = {scene: self.scene_folder(scene).resolve() for scene in self.scenes}
         for run in run_baseline(settings, self.checkout, scenes, self.seeds, path)["runs"]:
             seconds, psnr = run["curve"][-1]
