@@ -48,10 +48,10 @@ def test_a_run_reads_only_the_chosen_views(scene: Path) -> None:
         ({"num_views": 0}, "--num-views is 0: must be between 1 and 3"),
         ({"num_views": 4}, "--num-views is 4: must be between 1 and 3"),
         ({"num_views": 2, "views": (1,)}, "--num-views and --views: give one of them"),
-        ({"views": ()}, "name each view once"),
-        ({"views": (1, 1)}, "name each view once"),
-        ({"views": (0, 3)}, "numbered 0 to 2"),
-        ({"views": (-1,)}, "numbered 0 to 2"),
+        ({"views": ()}, "at least one of the training views"),
+        ({"views": (1, 1)}, "each once"),
+        ({"views": (0, 3)}, "the training views 0 to 2"),
+        ({"views": (-1,)}, "the training views 0 to 2"),
     ],
 )
 def test_invalid_choices_are_refused(choice: dict[str, Any], message: str, scene: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 from tqdm import tqdm
@@ -13,12 +14,11 @@ SECONDS_PER_LINE = 30
 LINE = "{desc}: {n_fmt}/{total_fmt}, {percentage:.0f} %, {remaining} left{postfix}"
 
 
-class Progress:
-    """Shows on stderr what part of a job is done and how long the rest will take. A context manager.
+class Progress(AbstractContextManager):
+    """Shows on stderr what part of a job is done and how long the rest will take.
 
     Args:
         total: steps of the whole job; 0 where `update` will tell.
-        label: what is being done.
         start: steps done in an earlier session.
         clock: seconds, for the lines of a log.
     """
@@ -41,21 +41,20 @@ class Progress:
         next_update, self._last_update = now + (now - self._last_update), now
         if self.total and next_update - self._last_line > SECONDS_PER_LINE:
             self._last_line = now
-            seconds = now - self._began
-            print(
-                tqdm.format_meter(
-                    done, self.total, seconds, prefix=self.label, postfix=note, initial=self.start, bar_format=LINE
-                ),
-                file=sys.stderr,
-                flush=True,
+            line = tqdm.format_meter(
+                done,
+                self.total,
+                now - self._began,
+                prefix=self.label,
+                postfix=note,
+                initial=self.start,
+                bar_format=LINE,
             )
+            print(line, file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Remove the bar."""
         self._bar.close()
-
-    def __enter__(self) -> Progress:
-        return self
 
     def __exit__(self, *_: Any) -> None:
         self.close()

@@ -18,7 +18,7 @@ import numpy as np
 
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import write_atomically, write_image, write_json
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 
 @dataclass(frozen=True)
@@ -29,24 +29,15 @@ class RunFolder:
 
     @classmethod
     def create(cls, config: TrainerConfig) -> RunFolder:
-        """A new folder for a resolved config; nothing existing is touched.
-
-        Raises:
-            InputError: the output folder cannot be written.
-        """
+        """A new folder for a resolved config; nothing existing is touched. InputError if it cannot be written."""
         parent = config.output_dir / str(config.experiment_name) / config.method_name
-        stamp, content = time.strftime("%Y-%m-%d_%H%M%S"), config_to_json(config)
-        try:
+        with os_errors_as_input_errors(f"--output-dir {config.output_dir}: cannot be written"):
             parent.mkdir(parents=True, exist_ok=True)
-            path = _new_folder(parent, stamp)
+            path = _new_folder(parent, time.strftime("%Y-%m-%d_%H%M%S"))
             (path / "checkpoints").mkdir()
             (path / "previews").mkdir()
-        except OSError as problem:
-            reason = problem.strerror or str(problem)
-            raise InputError(f"--output-dir {config.output_dir}: cannot be written ({reason})") from problem
-        run = cls(path)
-        write_json(run.path / "config.json", content)
-        return run
+        write_json(path / "config.json", config_to_json(config))
+        return cls(path)
 
     @property
     def checkpoints(self) -> Path:
@@ -78,24 +69,13 @@ class RunFolder:
         return config_from_json(default, values, f"{path}")
 
     def log(self, line: dict[str, Any]) -> None:
-        """Append a line to metrics.jsonl.
-
-        Raises:
-            InputError: it cannot be written.
-        """
+        """Append a line to metrics.jsonl; InputError if it cannot be written."""
         path = self.path / "metrics.jsonl"
-        try:
-            with open(path, "a", encoding="utf-8") as file:
-                file.write(json.dumps(line, allow_nan=False) + "\n")
-        except OSError as problem:
-            raise InputError(f"{path}: cannot be written ({problem.strerror})") from problem
+        with os_errors_as_input_errors(f"{path}: cannot be written"), open(path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
 
     def metrics(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; a last line cut short by a kill is left out.
-
-        Raises:
-            InputError: it is damaged.
-        """
+        """The lines of metrics.jsonl; a last line cut short by a kill is left out. InputError if it is damaged."""
         path = self.path / "metrics.jsonl"
         if not path.exists():
             return []

@@ -17,28 +17,34 @@ from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig, check_seconds
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
-from edge_se_sampler.engine.rendering import Picture, to_pictures
+from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
+from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
-def prepare(config: TrainerConfig) -> Trainer:
-    """Read the data, resolve the config, and create a run folder and its trainer.
+def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: OccupancyGrid | None = None) -> Trainer:
+    """Read the data, resolve the config, and set up a trainer.
+
+    Args:
+        run: the folder of a run that is continued, grid: the occupancy grid of its checkpoint; by default a new folder
+            is created, and the grid is the scene's.
 
     Raises:
         InputError: bad data or settings; nothing is written then.
     """
-    views, preview = _read(config)
-    device = choose_device(config.machine.device_type)
+    views, device = read_train_views(config), choose_device(config.machine.device_type)
+    held_out = _read_first_split(config, ("val", "test"))
+    preview = None if held_out is None else to_pictures(held_out)[0]
     config = resolve_config(config, views)
     disable_malloc_trimming()
-    pipeline = Pipeline.build(config, views, device)
-    return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=preview)
+    pipeline = Pipeline.build(config, views, device, grid)
+    return config.setup(run=run or RunFolder.create(config), pipeline=pipeline, preview=preview)
 
 
 def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
@@ -50,20 +56,13 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     check_seconds(max_seconds)
     config = dataclasses.replace(config, max_seconds=max_seconds)
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
-    views, preview = _read(config)
-    device = choose_device(config.machine.device_type)
-    disable_malloc_trimming()
-    pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
-    trainer = config.setup(run=run, pipeline=pipeline, preview=preview)
+    trainer = prepare(config, run, saved_grid(state["model"]))
     trainer.resume(state)
     return trainer
 
 
 def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
-    """A run's model with the weights of its last checkpoint, and that checkpoint.
-
-    Args:
-        config: the run's settings (`run.config`).
+    """A run's model with the weights of its last checkpoint, and that checkpoint; config is `run.config`'s.
 
     Raises:
         InputError: no checkpoint, or a bad one.
@@ -83,20 +82,17 @@ def read_test_views(config: TrainerConfig) -> Views:
     """
     if config.data is None or not config.data.is_dir():
         raise InputError(f"{config.data}: no such folder, where this run's held-out views were")
-    views = _read_first_split(config.data, ("test", "val"))
+    views = _read_first_split(config, ("test", "val"))
     if views is None:
         raise InputError(f"{config.data}: no held-out views; transforms_test.json or transforms_val.json is needed")
     return views
 
 
-def _read_first_split(data: Path, splits: Sequence[Split]) -> Views | None:
+def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views | None:
     """The first of the splits that has views."""
-    for split in splits:
-        if has_split(data, split):
-            views = read_blender(data, split)
-            if views.names:
-                return views
-    return None
+    assert config.data is not None
+    found = (read_blender(config.data, split) for split in splits if has_split(config.data, split))
+    return next((views for views in found if views.names), None)
 
 
 def read_train_views(config: TrainerConfig) -> Views:
@@ -120,28 +116,29 @@ def select_views(config: TrainerConfig, count: int) -> list[int] | None:
     Raises:
         InputError: both flags, more views than there are, an index twice or out of range.
     """
-    if config.num_views is not None:
-        if config.views is not None:
+    number, views = config.num_views, config.views
+    if number is not None:
+        if views is not None:
             raise InputError("--num-views and --views: give one of them")
-        if not 1 <= config.num_views <= count:
-            raise InputError(f"--num-views is {config.num_views}: must be between 1 and {count}, the training views")
-        return np.random.RandomState(0).permutation(count)[: config.num_views].tolist()
-    if config.views is None:
+        check_value("num-views", number, 1 <= number <= count, f"between 1 and {count}, the training views")
+        return np.random.RandomState(0).permutation(count)[:number].tolist()
+    if views is None:
         return None
-    if not config.views or len(set(config.views)) < len(config.views):
-        raise InputError(f"--views is {config.views}: name each view once, at least one")
-    if not all(0 <= number < count for number in config.views):
-        raise InputError(f"--views is {config.views}: the training views are numbered 0 to {count - 1}")
-    return list(config.views)
+    valid = len(views) > 0 and len(set(views)) == len(views) and set(views) <= set(range(count))
+    check_value("views", views, valid, f"at least one of the training views 0 to {count - 1}, each once")
+    return list(views)
 
 
 def describe_run(trainer: Trainer) -> str:
     """Where a run is written, its model, its length and its sampling, in four lines at most."""
     config, manager = trainer.config, trainer.pipeline.datamanager.config
     model, sampler = config.pipeline.model, manager.pixel_sampler
+    samples = "samples in occupied cells"
+    if isinstance(model, NeRFModelConfig):
+        samples = f"{model.num_coarse_samples} + {model.num_importance_samples} samples a ray"
     lines = [
         f"run      {trainer.run.path}",
-        f"model    {model.size}: {model.depth} x {model.width}, {_samples(model)}",
+        f"model    {model.size}: {model.depth} x {model.width}, {samples}",
         f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
     ]
     if isinstance(sampler, SamplingSettings):
@@ -153,26 +150,8 @@ def describe_run(trainer: Trainer) -> str:
     return "\n".join(lines)
 
 
-def _samples(model: ModelConfig) -> str:
-    if isinstance(model, NeRFModelConfig):
-        return f"{model.num_coarse_samples} + {model.num_importance_samples} samples a ray"
-    return "samples in occupied cells"
-
-
-def _read(config: TrainerConfig) -> tuple[Views, Picture | None]:
-    """Training views, and the first validation (or test) view for previews."""
-    views = read_train_views(config)
-    assert config.data is not None
-    held_out = _read_first_split(config.data, ("val", "test"))
-    return views, None if held_out is None else to_pictures(held_out)[0]
-
-
 def choose_device(device_type: str) -> str:
-    """The torch device of --machine.device-type.
-
-    Raises:
-        InputError: cuda, where torch finds no GPU.
-    """
+    """The torch device of --machine.device-type; InputError for cuda where torch finds no GPU."""
     if device_type == "cuda" and not torch.cuda.is_available():
         raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
     if device_type == "auto":
@@ -181,10 +160,9 @@ def choose_device(device_type: str) -> str:
 
 
 def disable_malloc_trimming() -> None:
-    """Make glibc's malloc keep large freed blocks instead of returning them to the kernel. Without glibc, do nothing.
+    """Make glibc's malloc, if there is one, keep large freed blocks instead of returning them to the kernel.
 
-    A training step on a CPU allocates the same megabytes again and again: the page faults of fresh ones take a third
-    of its time.
+    A training step on a CPU allocates the same megabytes again and again; page faults would take a third of its time.
     """
     m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
     with contextlib.suppress(OSError, AttributeError):

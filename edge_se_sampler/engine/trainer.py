@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -31,8 +31,6 @@ class Trainer:
 
     Args:
         config: resolved (see `resolve_config`).
-        run: the folder for checkpoints, metrics and previews.
-        pipeline: data manager and model.
         preview: a held-out view, rendered every now and then; None: no previews.
     """
 
@@ -46,9 +44,7 @@ class Trainer:
         self.elapsed = 0.0
         self.events = EventWriter(run.path)
         self.stop_requested = False
-        self.callbacks = self.pipeline.datamanager.get_training_callbacks(
-            TrainingCallbackAttributes(pipeline=self.pipeline, trainer=self)
-        )
+        self.callbacks = pipeline.datamanager.get_training_callbacks(TrainingCallbackAttributes(pipeline, self))
         self.dead_network_reset: DeadNetworkReset | None = None
         if config.reinit_dead:
             seed = config.machine.seed
@@ -57,11 +53,7 @@ class Trainer:
         self._preview_psnr: float | None = None
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Continue from a checkpoint's state.
-
-        Raises:
-            InputError: it is another model's.
-        """
+        """Continue from a checkpoint's state; InputError if it is another model's."""
         load_weights(self.pipeline.model, state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.scheduler.load_state_dict(state["scheduler"])
@@ -90,7 +82,8 @@ class Trainer:
                 ended = self.next_step == self.planned_steps
                 stop = ended or self.stop_requested or time.monotonic() >= deadline
                 if ended or step % config.steps_per_log == 0:
-                    self._log(step, loss, learning_rate)
+                    strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
+                    self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
                 if ended or self.next_step % config.preview_interval == 0:
                     self._preview(step)
                     began = time.monotonic() - self.elapsed  # a preview is not training time
@@ -102,11 +95,7 @@ class Trainer:
         self.events.close()
 
     def train_iteration(self, step: int) -> float:
-        """Train one step, and return its loss.
-
-        Raises:
-            FloatingPointError: the loss is not finite; the weights are as before.
-        """
+        """Train one step, and return its loss; FloatingPointError if that is not finite: the weights stay."""
         model = self.pipeline.model
         model.train()
         for callback in self.callbacks:
@@ -161,12 +150,11 @@ class Trainer:
             FloatingPointError: a weight is not finite; nothing is written.
             InputError: it cannot be written.
         """
+        step = self.next_step - 1
         if not all(torch.isfinite(weight).all() for weight in self.pipeline.model.parameters()):
-            raise FloatingPointError(
-                f"a weight is not finite after step {self.next_step - 1}; try a lower --optimizer.lr"
-            )
+            raise FloatingPointError(f"a weight is not finite after step {step}; try a lower --optimizer.lr")
         state = {
-            "step": self.next_step - 1,
+            "step": step,
             "elapsed": self.elapsed,
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
@@ -175,11 +163,7 @@ class Trainer:
             "dead_network_reset": None if self.dead_network_reset is None else self.dead_network_reset.state_dict(),
             "sampler": self.pipeline.datamanager.state_dict(),
         }
-        save_checkpoint(self.run.checkpoints, self.next_step - 1, state)
-
-    def _log(self, step: int, loss: float, learning_rate: float) -> None:
-        strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
-        self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
+        save_checkpoint(self.run.checkpoints, step, state)
 
     def _record(self, step: int, **values: Any) -> None:
         line = {"step": step, **values, "seconds": round(self.elapsed, 3)}
@@ -187,12 +171,10 @@ class Trainer:
         self.events.write(line)
 
     def _preview(self, step: int) -> None:
-        if self.preview_picture is None:
-            return
-        rendered, psnr = render_view(self.pipeline.model, self.preview_picture)
-        self._preview_psnr = psnr
-        self._record(step, val_psnr=psnr)
-        self.run.save_preview(step, rendered)
+        if self.preview_picture is not None:
+            rendered, self._preview_psnr = render_view(self.pipeline.model, self.preview_picture)
+            self._record(step, val_psnr=self._preview_psnr)
+            self.run.save_preview(step, rendered)
 
     def _status(self, loss: float) -> str:
         rate = self.next_step * self.config.preset.rays / self.elapsed
@@ -206,15 +188,13 @@ class Trainer:
         def request_stop(*_: Any) -> None:
             self.stop_requested = True
 
-        signals = (signal.SIGINT, signal.SIGTERM)
-        try:
-            previous = [(number, signal.signal(number, request_stop)) for number in signals]
-        except ValueError:  # only the main thread may handle signals
-            previous = []
+        previous = {}
+        with suppress(ValueError):  # only the main thread may handle signals
+            previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield
         finally:
-            for number, handler in previous:
+            for number, handler in previous.items():
                 signal.signal(number, handler)
 
 
@@ -224,8 +204,6 @@ def create_adam(
     """Adam over groups of weights, each with the scale of its learning rate."""
     parts = [{"params": weights, "lr": learning_rate * scale} for weights, scale in groups]
     if config.fused:
-        try:
+        with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
             return torch.optim.Adam(parts, eps=config.eps, fused=True)
-        except RuntimeError:  # before torch 2.4, for weights on a GPU only
-            pass
     return torch.optim.Adam(parts, eps=config.eps)

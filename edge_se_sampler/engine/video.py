@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -63,7 +64,7 @@ def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) ->
     """
     stacked, suffix = to_uint8(np.stack(frames)), path.suffix.lower()
     if suffix == ".gif":
-        settings = {"duration": 10 * round(100 / frames_per_second), "loop": 0}
+        settings: dict[str, Any] = {"duration": 10 * round(100 / frames_per_second), "loop": 0}
     else:
         if min(stacked.shape[1:3]) < 2:
             raise InputError(f"{path}: the views are 1 pixel wide or high, which is no video")
