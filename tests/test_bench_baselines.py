@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.bench.baselines import run as run_module
-from edge_se_sampler.bench.baselines.results import BaselineSettings, name_of, read_baseline, read_baselines
+from edge_se_sampler.bench.baselines.results import BaselineSettings, read_baselines
 from edge_se_sampler.bench.baselines.run import Clock, Task, TimeIsUp, mean_psnr, train
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.data.synthetic import make_scenes
@@ -110,9 +110,9 @@ def test_every_seed_is_trained_and_kept(data: Path, tmp_path: Path, edge_se: Any
         answer = edge_se("bench", "baselines", *options, "--flags=--netdepth 4", "--seeds", *seeds)
         assert answer.code == 0, answer
     path = tmp_path / "baselines" / "nerf-pytorch-4-x-64.json"
-    (result,) = read_baselines(tmp_path, ChartSettings(1, threads=2, image_size=24))
+    ((name, result),) = read_baselines(tmp_path, ChartSettings(1, threads=2, image_size=24)).items()
     commit = subprocess.run(["git", "-C", program, "rev-parse", "HEAD"], capture_output=True, text=True).stdout
-    assert name_of(result) == "nerf-pytorch, 4 x 64"
+    assert name == f"nerf-pytorch, 4 x 64 ({result['settings']['program_version']})"
     assert result["settings"]["flags"] == "--netdepth 4"
     assert commit.startswith(result["settings"]["program_version"])
     first, second = result["runs"]
@@ -180,16 +180,19 @@ RESULT = {
     ],
 )  # fmt: skip
 def test_a_file_of_another_format_is_refused(content: Any, tmp_path: Path) -> None:
-    path = tmp_path / "other.json"
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    write_baseline(tmp_path, content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(InputError, match=r"other.json: not a result of edge-se bench"):
-        read_baseline(path, ChartSettings())
+        read_baselines(tmp_path, ChartSettings())
 
 
 @pytest.mark.parametrize(("field", "value"), [("threads", 2), ("image_size", 400)])
 def test_times_of_other_threads_or_image_sizes_are_refused(field: str, value: int, tmp_path: Path) -> None:
-    path = tmp_path / "other.json"
-    path.write_text(json.dumps({**RESULT, "settings": {**SETTINGS, field: value}}))
-    assert read_baseline(path, ChartSettings(**{field: value}))["runs"] == RESULT["runs"]
+    write_baseline(tmp_path, json.dumps({**RESULT, "settings": {**SETTINGS, field: value}}))
+    assert list(read_baselines(tmp_path, ChartSettings(**{field: value}))) == ["other (1)"]
     with pytest.raises(InputError, match=rf"other.json: {field} is {value}, the chart's is 1"):
-        read_baseline(path, ChartSettings())
+        read_baselines(tmp_path, ChartSettings())
+
+
+def write_baseline(folder: Path, text: str) -> None:
+    (folder / "baselines").mkdir()
+    (folder / "baselines" / "other.json").write_text(text)

@@ -11,28 +11,23 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.bench.chart import trials as trials_module
+from edge_se_sampler.bench.chart.command import BenchChart
 from edge_se_sampler.bench.chart.figures import draw_chart, draw_scenes
 from edge_se_sampler.bench.chart.report import describe, draw, tables
 from edge_se_sampler.bench.chart.summary import (
+    END,
     always_better,
-    baseline_runs,
-    comparable_groups,
+    by_variant,
+    comparable,
     differences,
     mean_psnr_at,
     psnr_at,
-    upper_envelope,
+    psnr_over_time,
+    runs_on,
 )
-from edge_se_sampler.bench.chart.trials import (
-    ChartSettings,
-    Trial,
-    config_of,
-    iterations_within,
-    run_trial,
-    train_and_evaluate,
-    trials,
-)
+from edge_se_sampler.bench.chart.trials import ChartSettings, Trial, config_of, iterations_within, train_and_evaluate
 from edge_se_sampler.bench.chart.variants import COMPARISONS, VARIANTS
-from edge_se_sampler.bench.runner import write_result
+from edge_se_sampler.bench.runner import run_in_subprocess, write_result
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.engine.resolve import resolve_config
@@ -68,11 +63,11 @@ def test_comparisons_name_variants() -> None:
     assert {name for pair in COMPARISONS for name in pair} <= VARIANTS.keys()
 
 
-def test_trainings_that_are_compared_are_neighbors() -> None:
-    assert [trial.name for trial in trials(("lean", "edge"), ("mic", "chair"), (0, 1))][:3] == [
-        "lean-mic-0", "edge-mic-0", "lean-chair-0",
-    ]  # fmt: skip
-    assert len(trials((), ("mic",), (0,))) == len(VARIANTS)
+def test_trainings_that_are_compared_are_neighbors(tmp_path: Path) -> None:
+    chart = BenchChart(output_dir=tmp_path, variants=("lean", "edge"), scenes=("mic", "chair"), seeds=(0, 1))
+    trials = chart.experiment().trials([])
+    assert [trial.name for trial in trials][:3] == ["lean-mic-0", "edge-mic-0", "lean-chair-0"]
+    assert len(BenchChart(output_dir=tmp_path, seeds=(0,)).experiment().trials([])) == len(VARIANTS)
 
 
 # -- a training
@@ -91,7 +86,7 @@ def test_a_training_fills_its_time_and_is_evaluated_on_the_way(data: Path, monke
 
 
 def test_peak_memory_is_the_trainings_alone(data: Path) -> None:
-    run = run_trial(Trial("lean", "mic", 1), ChartSettings(seconds=1), data)
+    run = run_in_subprocess(train_and_evaluate, Trial("lean", "mic", 1), ChartSettings(seconds=1), data)
     assert run["peak_bytes"] > 2**22
 
 
@@ -164,11 +159,14 @@ def test_medians_over_seeds_then_means_over_scenes() -> None:
     assert mean_psnr_at(runs, 1) is None  # one scene has not been evaluated yet
 
 
-def test_the_upper_envelope_is_the_best_variant_at_every_evaluation() -> None:
+def test_the_upper_envelope_is_the_best_variant_at_every_evaluation(tmp_path: Path) -> None:
     runs = [run_of("lean", "mic", 0, [(1, 20), (60, 30)]), run_of("edge", "mic", 0, [(1, 25), (60, 28)])]
-    rows = {seconds: (best, gap) for seconds, best, _, gap in upper_envelope(runs)}
-    assert rows[1] == ("edge", 5)
-    assert rows[60] == ("lean", 0)
+    runs += [run_of("se", "mic", 0, [(3, 10), (20, 10)])]
+    rows = psnr_over_time(runs)
+    assert (rows[1], rows[END]) == ({"lean": 20, "edge": 25}, {"lean": 30, "edge": 28, "se": 10})
+    text = describe(folder_of(tmp_path, runs)).split("## Which variant is best when")[1]
+    assert row_of(text, "1 s") == ["Edge", "25.00", "5.00"]
+    assert row_of(text, "end") == ["lean-nerf", "30.00", "0.00"]
 
 
 def test_who_is_better_at_every_evaluation_is_found() -> None:
@@ -192,19 +190,18 @@ def test_differences_are_of_common_seeds_scene_by_scene() -> None:
 
 def test_only_common_scenes_and_seeds_are_compared() -> None:
     runs = [run_of("lean", scene, 0, [(1, 20)]) for scene in ("mic", "chair")] + [run_of("edge", "mic", 0, [(1, 9)])]
-    assert {run["scene"] for found in comparable_groups(runs).values() for run in found} == {"mic"}
+    assert {run["scene"] for found in comparable(by_variant(runs)).values() for run in found} == {"mic"}
     runs += [run_of("lean", "mic", 1, [(1, 20)]), run_of("rays-128", "chair", 0, [(1, 20)])]
-    by_variant = comparable_groups(runs, ("methods",))
-    assert {name: [run["seed"] for run in found] for name, found in by_variant.items()} == {"lean": [0], "edge": [0]}
-    assert {run["scene"] for run in comparable_groups(runs, ("size",))["lean"]} == {"chair"}
-    assert comparable_groups(runs) == comparable_groups([]) == {}  # nothing in common, or nothing at all
+    methods = comparable(by_variant(runs, ["methods"]))
+    assert {name: [run["seed"] for run in found] for name, found in methods.items()} == {"lean": [0], "edge": [0]}
+    assert {run["scene"] for run in comparable(by_variant(runs, ["size"]))["lean"]} == {"chair"}
+    assert comparable(by_variant(runs)) == comparable({}) == {}  # nothing in common, or nothing at all
 
 
-def test_a_baseline_is_compared_only_if_it_has_all_scenes() -> None:
-    runs = [run_of("lean", scene, 0, [(1, 20), (3, 25)]) for scene in ("mic", "chair")]
-    assert baseline_runs(baseline([("mic", 0, [[1, 20.0]])]), runs) == []
-    complete = baseline([(scene, 0, [[1, 20.0]]) for scene in ("mic", "chair", "ship")])
-    assert [run["scene"] for run in baseline_runs(complete, runs)] == ["mic", "chair"]
+def test_only_runs_on_all_scenes_are_compared() -> None:
+    runs = [{"scene": "mic", "seed": 0}, {"scene": "chair", "seed": 1}, {"scene": "ship", "seed": 0}]
+    assert runs_on(runs[:1], ["mic", "chair"]) == []
+    assert runs_on(runs, ["mic", "chair"]) == runs[:2]
 
 
 # -- the report
@@ -222,6 +219,7 @@ def test_the_table_of_methods_counts_failures_and_has_baselines(tmp_path: Path) 
     table = tables(folder_of(tmp_path, runs, baseline([("mic", 0, [[1, 20.0], [2, 21.0]])])))["methods"]
     assert row_of(table, "Random")[-2:] == ["16.00", "2 of 3"]
     assert row_of(table, "other (1)") == ["21.00", "21.00", "21.00", "–"]
+    assert "| lean-nerf" not in table  # not trained
 
 
 def test_every_scene_has_its_column_and_failures_are_bracketed(tmp_path: Path) -> None:
@@ -233,7 +231,7 @@ def test_every_scene_has_its_column_and_failures_are_bracketed(tmp_path: Path) -
     assert row_of(text, "") == ["chair", "mic", "mean", "least", "failed"]
     assert row_of(text, "lean-nerf") == ["20.00", "21.00", "20.50", "20.00", "0 of 2"]
     assert row_of(text, "Edge") == ["(10.00)", "11.00", "10.50", "10.00", "1 of 2"]
-    assert row_of(text, "other") == ["23.00", "24.00", "23.50", "23.00", "–"]
+    assert row_of(text, "other (1)") == ["23.00", "24.00", "23.50", "23.00", "–"]
     assert "| SE |" not in text
 
 
@@ -247,13 +245,13 @@ def test_pictures_are_drawn_where_there_is_something_to_compare(tmp_path: Path) 
 
 def test_curves_of_a_single_evaluation_are_drawn() -> None:
     runs = [run_of(name, "mic", s, [(1 + s, 20 + s)]) for name in ("lean", "edge") for s in (1, 2)]
-    figure = draw_chart(runs, [], ChartSettings(seconds=2))
+    figure = draw_chart(runs, {}, ChartSettings(seconds=2))
     drawn = [line for line in figure.axes[0].lines if "lean" in str(line.get_label())]
     np.testing.assert_array_equal(drawn[0].get_xydata(), [[3, 21.5]])
-    labels = [text.get_text() for text in draw_scenes(runs, [], ChartSettings(seconds=2)).legends[0].get_texts()]
+    labels = [text.get_text() for text in draw_scenes(runs, {}, ChartSettings(seconds=2)).legends[0].get_texts()]
     assert sorted(labels) == ["Edge", "lean-nerf"]  # once each, whatever the seeds
     parts = [run_of("no-hull", "mic", 0, [(1, 20)], "collapsed"), run_of("rays-128", "chair", 0, [(1, 22)])]
-    mic, chair = draw_scenes(parts, [], ChartSettings(seconds=2)).axes[1::-1]
+    mic, chair = draw_scenes(parts, {}, ChartSettings(seconds=2)).axes[1::-1]
     assert [line.get_marker() for line in mic.lines] == ["None", "x"]
     assert [len(axis.lines) for axis in (mic, chair)] == [2, 1]
 

@@ -40,6 +40,6 @@ class BenchBaselines(ChartOptions):
         make_folder(path.parent, "--output-dir")
         check_output(path, "--output-dir")
         scenes = {scene: self.scene_folder(scene).resolve() for scene in self.scenes}
-        for run in run_baseline(settings, self.checkout, scenes, self.seeds, path)["runs"]:
+        for run in run_baseline(settings, self.checkout, scenes, self.seeds, path):
             seconds, psnr = run["curve"][-1]
             print(f"{settings.name}, {run['scene']}, {run['seed']}: {psnr:.2f} dB after {seconds:.0f} s")

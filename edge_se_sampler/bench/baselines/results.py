@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.chart.trials import ChartSettings
-from edge_se_sampler.bench.runner import read_result
+from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.errors import InputError
-
-FOLDER = "baselines"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,43 +35,37 @@ class BaselineSettings(ChartSettings):
         return f"{self.program}, {self.label}" if self.label else self.program
 
 
-def name_of(baseline: dict[str, Any]) -> str:
-    """Program and label of a result."""
-    return BaselineSettings(**baseline["settings"]).name
-
-
 def path_of(settings: BaselineSettings, folder: Path) -> Path:
     """Where a baseline's result lies in a chart's folder."""
-    return folder / FOLDER / f"{'-'.join(re.findall(r'[A-Za-z0-9.]+', settings.name))}.json"
+    return folder / "baselines" / f"{'-'.join(re.findall(r'[A-Za-z0-9.]+', settings.name))}.json"
 
 
-def read_baselines(folder: Path, settings: ChartSettings) -> list[dict[str, Any]]:
-    """The baselines in a chart's folder, in the order of their file names.
-
-    Raises:
-        InputError: a file cannot be read, lacks something, or was timed otherwise than the chart.
-    """
-    return [read_baseline(path, settings) for path in sorted((folder / FOLDER).glob("*.json"))]
-
-
-def read_baseline(path: Path, settings: ChartSettings) -> dict[str, Any]:
-    """A baseline's result.
+def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str, Any]]:
+    """Name and version -> result of the baselines in a chart's folder, in the order of their file names.
 
     Raises:
-        InputError: it cannot be read, lacks something, or is of another number of threads or size of images.
+        InputError: a file cannot be read, lacks something, or is of another number of threads or size of images.
     """
-    result = read_result(path)
-    try:
-        timed = BaselineSettings(**result["settings"])
-        for run in result["runs"]:
-            times = [float(seconds) for seconds, _ in run["curve"]]
-            valid = [isinstance(run["scene"], str), bool(times), times == sorted(times), min(times) > 0]
-            if not (all(valid) and all(math.isfinite(float(psnr)) for _, psnr in run["curve"])):
-                raise ValueError(f"the curve of {run['scene']}, seed {run['seed']}, is not ascending seconds and PSNR")
-    except (ValueError, KeyError, TypeError) as problem:
-        raise InputError(f"{path}: not a result of edge-se bench baselines ({problem!r})") from problem
-    for key in ("threads", "image_size"):
-        value, expected = getattr(timed, key), getattr(settings, key)
-        if value != expected:
-            raise InputError(f"{path}: {key} is {value}, the chart's is {expected}: their seconds cannot be compared")
-    return result
+    baselines = {}
+    for path in sorted((folder / "baselines").glob("*.json")):
+        result = read_result(path)
+        try:
+            found = BaselineSettings(**result["settings"])
+            for run in result["runs"]:
+                _check_curve(run)
+        except (ValueError, KeyError, TypeError) as problem:
+            raise InputError(f"{path}: not a result of edge-se bench baselines ({problem!r})") from problem
+        for key in ("threads", "image_size"):
+            value, expected = getattr(found, key), getattr(settings, key)
+            if value != expected:
+                raise InputError(f"{path}: {key} is {value}, the chart's is {expected}: seconds cannot be compared")
+        baselines[f"{found.name} ({found.program_version})"] = result
+    return baselines
+
+
+def _check_curve(run: Run) -> None:
+    scene, seed, curve = run["scene"], run["seed"], run["curve"]
+    times = [seconds for seconds, _ in curve]
+    finite = all(math.isfinite(psnr) for _, psnr in curve)
+    if not (isinstance(scene, str) and curve and finite and times == sorted(times) and times[0] > 0):
+        raise ValueError(f"the curve of {scene}, seed {seed}, is not ascending seconds and PSNR")

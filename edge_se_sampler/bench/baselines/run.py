@@ -19,7 +19,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from itertools import product
@@ -79,17 +79,6 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Task:
-    """A training of another program's."""
-
-    settings: BaselineSettings
-    checkout: Path | None
-    """None where this environment has it."""
-    data: Path
-    seed: int
-
-
-@dataclass(frozen=True)
 class Trial:
     """What identifies a training in its json."""
 
@@ -97,9 +86,20 @@ class Trial:
     seed: int
 
 
+@dataclass(frozen=True)
+class Task:
+    """What a program is given."""
+
+    settings: BaselineSettings
+    checkout: Path | None
+    """None where this environment has the program."""
+    data: Path
+    seed: int
+
+
 def run_baseline(
     settings: BaselineSettings, checkout: Path | None, scenes: Mapping[str, Path], seeds: Sequence[int], path: Path
-) -> dict[str, Any]:
+) -> list[Run]:
     """Train another program on scenes (name -> Blender folder) with seeds, one after the other.
 
     Args:
@@ -117,7 +117,7 @@ def run_baseline(
             raise InputError(f"{settings.name} on {trial.scene}, seed {trial.seed}: {problem}") from None
         result["runs"].append({**asdict(trial), **run})
         write_result(path, result)
-    return result
+    return result["runs"]
 
 
 def train(task: Task) -> Run:
@@ -127,25 +127,32 @@ def train(task: Task) -> Run:
     clock = Clock(settings)
     if task.checkout is not None:
         sys.path.insert(0, str(task.checkout.resolve()))
+    try:
+        with silent_folder() as folder:
+            PROGRAMS[settings.program](task, folder, clock)
+    except TimeIsUp:
+        return {"steps": clock.steps, "curve": clock.curve}
+    except (Exception, SystemExit) as problem:  # whatever another program raises
+        raise InputError(
+            f"{settings.program} with --checkout {task.checkout}, flags {settings.flags!r}: "
+            f"{type(problem).__name__}: {problem}"
+        ) from None
+    raise InputError(
+        f"{settings.program} ended by itself after {clock.steps} steps, before {settings.seconds:g} s were over: "
+        f"give it more steps in --flags, now {settings.flags!r}"
+    )
+
+
+@contextlib.contextmanager
+def silent_folder() -> Iterator[Path]:
+    """A temporary folder for what a program writes; it prints nothing."""
     with (
         tempfile.TemporaryDirectory() as folder,
         open(os.devnull, "w") as null,
         contextlib.redirect_stdout(null),
         contextlib.redirect_stderr(null),
     ):
-        try:
-            PROGRAMS[settings.program](task, Path(folder), clock)
-        except TimeIsUp:
-            return {"steps": clock.steps, "curve": clock.curve}
-        except (Exception, SystemExit) as problem:  # whatever another program raises
-            raise InputError(
-                f"{settings.program} with --checkout {task.checkout}, flags {settings.flags!r}: "
-                f"{type(problem).__name__}: {problem}"
-            ) from None
-    raise InputError(
-        f"{settings.program} ended by itself after {clock.steps} steps, before {settings.seconds:g} s were over: "
-        f"give it more steps in --flags, now {settings.flags!r}"
-    )
+        yield Path(folder)
 
 
 def _nerf_pytorch(task: Task, folder: Path, clock: Clock) -> None:
@@ -208,7 +215,6 @@ def _nerfstudio(task: Task, folder: Path, clock: Clock) -> None:
     trainer = build_trainer(config, "test")
 
     def evaluate(step: int) -> None:
-        del step
         clock.after_step(lambda: mean_psnr(render_test_views(trainer), task.data))
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], evaluate))
@@ -226,11 +232,8 @@ PROGRAMS: dict[str, Callable[[Task, Path, Clock], None]] = {
 def mean_psnr(rendered: Sequence[np.ndarray], data: Path) -> float:
     """Of the test views (H, W, 3) in front of white, the mean over views."""
     pictures = to_pictures(read_blender(data, "test"))
-    rows = [
-        compute_metrics(np.clip(image, 0, 1), picture.image, 1.0)
-        for image, picture in zip(rendered, pictures, strict=True)
-    ]
-    return statistics.mean(row["psnr"] or 0.0 for row in rows)
+    pairs = zip(rendered, pictures, strict=True)
+    return statistics.mean(compute_metrics(np.clip(image, 0, 1), p.image, 1.0)["psnr"] or 0.0 for image, p in pairs)
 
 
 def _seed(seed: int) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_se_sampler.bench.chart.variants import VARIANTS
 from edge_se_sampler.bench.command import ExperimentCommand
-from edge_se_sampler.errors import InputError, check_known
+from edge_se_sampler.errors import InputError, check_known, check_value
 
 if TYPE_CHECKING:
     from edge_se_sampler.bench.chart.trials import ChartSettings
@@ -39,29 +42,21 @@ class ChartOptions:
             InputError: a value has no meaning, or the scenes' images differ in size.
         """
         from edge_se_sampler.bench.chart.trials import ChartSettings
-
-        if not (self.seeds and self.scenes):
-            raise InputError("--seeds and --scenes: give at least one of each")
-        if not 1 <= self.seconds < float("inf"):
-            raise InputError(f"--seconds is {self.seconds}: must be at least 1")
-        if self.threads < 1:
-            raise InputError(f"--threads is {self.threads}: must be at least 1")
-        return ChartSettings(self.seconds, self.threads, self._image_size())
-
-    def _image_size(self) -> int:
-        """Longer side of the scenes' images."""
-        from edge_se_sampler.bench.chart.trials import ChartSettings
         from edge_se_sampler.data.blender import read_blender
         from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
 
+        if not (self.seeds and self.scenes):
+            raise InputError("--seeds and --scenes: give at least one of each")
+        check_value("seconds", self.seconds, 1 <= self.seconds < math.inf, "at least 1")
+        check_value("threads", self.threads, self.threads >= 1, "at least 1")
         if self.data is None:
             check_known("scenes", self.scenes, ANALOG_OF)
-            return ChartSettings.image_size
+            return ChartSettings(self.seconds, self.threads)
         sizes = {scene: max(read_blender(self.data / scene, "train").images[0].shape[:2]) for scene in self.scenes}
         if len(set(sizes.values())) > 1:
             listed = ", ".join(f"{scene} {size}" for scene, size in sizes.items())
             raise InputError(f"--data {self.data}: scenes of different sizes ({listed} pixels): chart them separately")
-        return next(iter(sizes.values()))
+        return ChartSettings(self.seconds, self.threads, sizes[self.scenes[0]])
 
     def scene_folder(self, scene: str) -> Path:
         """A scene's Blender folder; a synthetic one is rendered if it is missing."""
@@ -82,18 +77,18 @@ class BenchChart(ChartOptions, ExperimentCommand):
 
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.baselines.results import read_baselines
-        from edge_se_sampler.bench.chart.trials import run_trial, trials
-        from edge_se_sampler.bench.runner import Experiment
+        from edge_se_sampler.bench.chart.trials import Trial, train_and_evaluate
+        from edge_se_sampler.bench.runner import Experiment, run_in_subprocess
 
         check_known("variants", self.variants, VARIANTS)
         settings = self.settings()
         read_baselines(self.output_dir, settings)  # refuses, before anything is trained, those that cannot be compared
+        # seed by seed and scene by scene, so that what is compared is trained side by side
+        keys = product(self.seeds, self.scenes, self.variants or VARIANTS)
+        trials = [Trial(variant, scene, seed) for seed, scene, variant in keys]
+        train = partial(run_in_subprocess, train_and_evaluate)  # a process has a single peak of memory
         return Experiment(
-            "chart",
-            settings,
-            lambda runs: trials(self.variants, self.scenes, self.seeds),
-            run_trial,
-            lambda trial: (settings, self.scene_folder(trial.scene)),
+            "chart", settings, lambda _: trials, train, lambda trial: (settings, self.scene_folder(trial.scene))
         )
 
     def default_workers(self) -> int:

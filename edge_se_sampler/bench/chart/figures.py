@@ -2,141 +2,99 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.baselines.results import name_of
-from edge_se_sampler.bench.chart.summary import (
-    baseline_runs,
-    comparable_groups,
-    mean_psnr_at,
-    runs_of,
-    scenes_of,
-    upper_envelope,
-)
+from edge_se_sampler.bench.chart.summary import by_variant, comparable, mean_psnr_at, runs_on, scenes_of
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
-from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, TOP, VARIANTS, Group
+from edge_se_sampler.bench.chart.variants import RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.engine.figures import require_pyplot
 
-RECOMMENDED_STYLE = ("black", "-")
-Style = tuple[str, str]
-"""Color and line style."""
 
+def draw_chart(runs: list[Run], baselines: Mapping[str, list[Run]], settings: ChartSettings) -> Any:
+    """PSNR over training time of the methods and their error sources, bands over seeds; baselines dotted.
 
-def time_label(settings: ChartSettings) -> str:
-    """What is meant by a second."""
-    return "CPU seconds of training, one core" if settings.threads == 1 else f"seconds on {settings.threads} cores"
-
-
-def draw_chart(runs: list[Run], baselines: Sequence[dict[str, Any]], settings: ChartSettings) -> Any:
-    """PSNR over training time of the methods and their error sources, bands over seeds; baselines dotted; behind them
-    a wide line along the best, named in the order of time."""
-    figure, axis = require_pyplot().subplots(figsize=(8.8, 5.2))
-    shown = comparable_groups(runs, TOP)
-    for name, style in _styles(shown).items():
-        _draw_curve(axis, shown[name], VARIANTS[name].label, style, name == RECOMMENDED)
-    shown_runs = [run for of_variant in shown.values() for run in of_variant]
-    for i, baseline in enumerate(baselines):
-        if found := baseline_runs(baseline, shown_runs):
-            label = f"{name_of(baseline)} ({baseline['settings']['program_version']})"
-            _draw_curve(axis, found, label, (f"C{(i + 4) % 10}", ":"), False)
-    envelope = upper_envelope(shown_runs)
-    best = list(dict.fromkeys(VARIANTS[name].label for _, name, _, _ in envelope))
-    axis.plot(
-        [row[0] for row in envelope], [row[2] for row in envelope], color="0.85", lw=9, zorder=0,
-        label=f"best: {', then '.join(best)}",
-    )  # fmt: skip
-    axis.set_ylabel("test PSNR [dB]")
-    axis.set_title(f"scenes: {', '.join(scenes_of(shown_runs))}; bands: least to greatest of the seeds", fontsize=9)
-    _finish(axis, time_label(settings))
-    axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    figure.tight_layout()
+    Args:
+        baselines: label -> runs.
+    """
+    figure, axis = require_pyplot().subplots(figsize=(8.8, 5.2), layout="constrained")
+    compared = comparable(by_variant(runs, TOP))
+    scenes = scenes_of(next(iter(compared.values())))
+    styles = _styles(compared)
+    for name, found in compared.items():
+        failures = sum(map(failed, found))
+        label = VARIANTS[name].label + (f", {failures} of {len(found)} failed" if failures else "")
+        _draw_curve(axis, found, label=label, **styles[name])
+    for i, (label, all_runs) in enumerate(baselines.items(), 4):
+        if found := runs_on(all_runs, scenes):
+            _draw_curve(axis, found, label=label, color=f"C{i % 10}", linestyle=":")
+    axis.set(xlabel=f"training time [{settings.unit}]", ylabel="test PSNR [dB]")
+    axis.set_title(f"scenes: {', '.join(scenes)}; bands: least to greatest of the seeds", fontsize=9)
+    _set_time_axis(axis)
+    figure.legend(fontsize=8, frameon=False, loc="outside right upper")
     return figure
 
 
-def draw_parts(runs: list[Run], groups: Sequence[Group], settings: ChartSettings) -> Any:
-    """PSNR over training time of what is changed of the recommended method, a panel a group of changes."""
-    figure, axes = require_pyplot().subplots(
-        1, len(groups), figsize=(4.4 * len(groups), 6.4), sharey=True, squeeze=False
-    )
-    for axis, group in zip(axes[0], groups, strict=True):
-        for i, (name, found) in enumerate(comparable_groups(runs, (group,)).items()):
-            strong = name == RECOMMENDED
-            style = RECOMMENDED_STYLE if strong else (f"C{i % 10}", "-" if i < 11 else "--")
-            _draw_curve(axis, found, VARIANTS[name].label, style, strong)
-        axis.set_title(GROUPS[group][0], fontsize=10)
-        _finish(axis, time_label(settings))
-        axis.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14))
-    axes[0, 0].set_ylabel("test PSNR [dB]")
-    figure.tight_layout()
-    return figure
-
-
-def draw_scenes(runs: list[Run], baselines: Sequence[dict[str, Any]], settings: ChartSettings) -> Any:
+def draw_scenes(runs: list[Run], baselines: Mapping[str, list[Run]], settings: ChartSettings) -> Any:
     """The methods, or what there is if there are none: a panel a scene, a line a seed; failed ones end in a cross."""
     scenes = scenes_of(runs)
     columns = min(4, len(scenes))
     rows = -(-len(scenes) // columns)
     figure, axes = require_pyplot().subplots(
-        rows, columns, figsize=(3.1 * columns, 2.7 * rows), squeeze=False, sharex=True, sharey=True
+        rows, columns, figsize=(3.1 * columns, 2.7 * rows), squeeze=False, sharey=True, layout="constrained"
     )
-    trained = [name for name in VARIANTS if runs_of(runs, name)]
-    shown = [name for name in trained if VARIANTS[name].group == "methods"] or trained
-    labelled: set[str] = set()
-
-    def plot(axis: Any, run: Run, label: str, line: str, **style: Any) -> None:
-        x, y = [row[0] for row in run["curve"]], [row[-1] for row in run["curve"]]
-        axis.plot(x, y, line, label=None if label in labelled else label, **style)
-        labelled.add(label)
-
-    for axis, scene in zip(axes.ravel(), scenes, strict=False):
-        for name, (color, line) in _styles(shown).items():
-            for run in runs_of(runs, name, scene):
-                plot(axis, run, VARIANTS[name].label, line, color=color, lw=1.6 if name == RECOMMENDED else 0.9)
+    shown = by_variant(runs, ["methods"]) or by_variant(runs)
+    styles = _styles(shown)
+    for axis, scene in zip(axes.flat, scenes, strict=False):
+        for name, found in shown.items():
+            for run in (run for run in found if run["scene"] == scene):
+                _draw_run(axis, run, label=VARIANTS[name].full_label, **styles[name])
                 if failed(run):
-                    axis.plot(run["curve"][-1][0], run["curve"][-1][-1], "x", color=color, ms=6)
-        for run in (run for baseline in baselines for run in baseline["runs"] if run["scene"] == scene):
-            plot(axis, run, "other programs", ":", color="black", lw=1)
+                    axis.plot(run["curve"][-1][0], run["curve"][-1][-1], "x", color=styles[name]["color"])
+        for run in (run for found in baselines.values() for run in found if run["scene"] == scene):
+            _draw_run(axis, run, label="other programs", color="black", linestyle=":", linewidth=1)
         axis.set_title(scene)
-        _finish(axis, "")
-    for axis in axes.ravel()[len(scenes) :]:
+        _set_time_axis(axis)
+    for axis in axes.flat[len(scenes) :]:
         axis.set_visible(False)
-    for axis in axes.ravel()[len(scenes) - columns : len(scenes)]:
-        axis.tick_params(labelbottom=True)  # also above an empty panel
-    figure.legend(loc="lower center", ncols=4, fontsize=8, frameon=False)
-    figure.supylabel("test PSNR [dB]", fontsize=9)
-    figure.supxlabel(time_label(settings), fontsize=9, y=0.1)
-    figure.tight_layout(rect=(0, 0.1, 1, 1))
+    handles = {}
+    for axis in axes.flat:
+        handles |= {label: line for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    figure.suptitle(f"test PSNR [dB] over training time [{settings.unit}]", fontsize=10)
     return figure
 
 
-def _styles(names: Collection[str]) -> dict[str, Style]:
-    """The recommended variant black, methods solid, error sources dashed."""
+def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The recommended variant black and wide, methods solid, error sources dashed."""
     others = [name for name in names if name != RECOMMENDED]
-    lines = ("--" if VARIANTS[name].group == "errors" else "-" for name in others)
-    styles = {name: (f"C{i % 10}", line) for i, (name, line) in enumerate(zip(others, lines, strict=True))}
-    return {name: styles.get(name, RECOMMENDED_STYLE) for name in names}
+    styles: dict[str, dict[str, Any]] = {RECOMMENDED: {"color": "black", "linewidth": 2.4, "zorder": 3}}
+    for i, name in enumerate(others):
+        linestyle = "--" if VARIANTS[name].group == "errors" else "-"
+        styles[name] = {"color": f"C{i % 10}", "linestyle": linestyle, "linewidth": 1.2}
+    return styles
 
 
-def _draw_curve(axis: Any, runs: list[Run], label: str, style: Style, strong: bool) -> None:
-    """The median over seeds, a mean over scenes, and the band from the least to the largest seed."""
+def _draw_curve(axis: Any, runs: list[Run], color: str, **style: Any) -> None:
+    """The median over seeds, a mean over scenes, and the band from the least to the greatest seed."""
     first = max(run["curve"][0][0] for run in runs)
     last = max(first, min(run["curve"][-1][0] for run in runs))
     moments = sorted({first, *(seconds for seconds in EVAL_SECONDS if first < seconds < last), last})
     low, middle, high = ([mean_psnr_at(runs, t, over) for t in moments] for over in (np.min, np.median, np.max))
-    failures = sum("outcome" in run and failed(run) for run in runs)  # baselines have no outcome
-    label += f", {failures} of {len(runs)} failed" if failures else ""
-    color, line = style
-    axis.plot(moments, middle, line, color=color, lw=2.6 if strong else 1.3, label=label, zorder=3 if strong else 2)
-    axis.fill_between(moments, low, high, color=color, alpha=0.12, lw=0)
+    axis.plot(moments, middle, color=color, **style)
+    axis.fill_between(moments, low, high, color=color, alpha=0.12, linewidth=0)
 
 
-def _finish(axis: Any, label: str) -> None:
-    axis.set(xscale="log", xlabel=label)
+def _draw_run(axis: Any, run: Run, **style: Any) -> None:
+    axis.plot([row[0] for row in run["curve"]], [row[-1] for row in run["curve"]], **style)
+
+
+def _set_time_axis(axis: Any) -> None:
+    axis.set_xscale("log")
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
     ticks = [tick for tick in (1, 3, 10, 30, 100) if tick < 2 * axis.dataLim.x1]

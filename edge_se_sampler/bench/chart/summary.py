@@ -1,33 +1,39 @@
-"""What the chart's runs say: PSNR after seconds of training, and which variant is best when.
+"""What the chart's runs say: PSNR after seconds of training, compared on the scenes and seeds that all variants have.
 
-A variant's PSNR at a moment is the mean over scenes of the median over seeds; a run that has ended stays at what it
-ended with. Variants are only compared on the scenes and seeds that all of them have.
+PSNR at a moment is the mean over scenes of the median over seeds; a run that has ended stays at what it ended with.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS
-from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, VARIANTS, Group
+from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, VARIANTS
 from edge_se_sampler.bench.runner import Run
 
 END = float("inf")
 """The moment at which every training has ended."""
 
 
-def scenes_of(runs: list[Run]) -> list[str]:
+def scenes_of(runs: Iterable[Run]) -> list[str]:
     """Scenes, in alphabetical order."""
     return sorted({run["scene"] for run in runs})
 
 
-def runs_of(runs: list[Run], variant: str, scene: str | None = None) -> list[Run]:
-    """The runs of a variant, and of a scene."""
-    return [run for run in runs if run["variant"] == variant and scene in (None, run["scene"])]
+def runs_on(runs: list[Run], scenes: Collection[str]) -> list[Run]:
+    """The runs on some scenes; none if one of the scenes has none."""
+    found = [run for run in runs if run["scene"] in scenes]
+    return found if {run["scene"] for run in found} == set(scenes) else []
+
+
+def moments_of(runs: list[Run]) -> list[float]:
+    """The seconds of evaluations before the last one, and END."""
+    longest = max((run["seconds"] for run in runs), default=0.0)
+    return [*(seconds for seconds in EVAL_SECONDS if 1.05 * seconds < longest), END]
 
 
 def psnr_at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
@@ -38,71 +44,55 @@ def psnr_at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
         curve: rows that begin with seconds and end with PSNR.
     """
     times, psnr = [row[0] for row in curve], [row[-1] for row in curve]
-    if not times or seconds < times[0] * 0.99:
+    if seconds < times[0] * 0.99:
         return None
     return float(np.interp(np.log(seconds), np.log(times), psnr))
 
 
 def mean_psnr_at(runs: list[Run], seconds: float, over_seeds: Callable[[Any], Any] = np.median) -> float | None:
     """Mean over scenes of the median (or another statistic) over seeds; None if a run has not been evaluated yet."""
-    values = {scene: [psnr_at(r["curve"], seconds) for r in runs if r["scene"] == scene] for scene in scenes_of(runs)}
-    if not values or any(value is None for of_seeds in values.values() for value in of_seeds):
+    psnr = {scene: [psnr_at(r["curve"], seconds) for r in runs if r["scene"] == scene] for scene in scenes_of(runs)}
+    if not psnr or any(value is None for of_seeds in psnr.values() for value in of_seeds):
         return None
-    return statistics.mean(float(over_seeds(of_seeds)) for of_seeds in values.values())
+    return statistics.mean(float(over_seeds(of_seeds)) for of_seeds in psnr.values())
 
 
-def comparable(runs: list[Run], variants: Collection[str]) -> dict[str, list[Run]]:
-    """Those of some variants that have runs -> their runs on the scenes and seeds that all of them have; empty if there
-    are none."""
-    by_variant = {name: found for name in VARIANTS if name in variants and (found := runs_of(runs, name))}
-    keys = [{(run["scene"], run["seed"]) for run in found} for found in by_variant.values()]
+def comparable(runs_by_name: Mapping[str, list[Run]]) -> dict[str, list[Run]]:
+    """The runs on the scenes and seeds that all names have; empty if there are none."""
+    keys = [{(run["scene"], run["seed"]) for run in runs} for runs in runs_by_name.values()]
     common = set.intersection(*keys) if keys else set()
     if not common:
         return {}
-    return {name: [r for r in found if (r["scene"], r["seed"]) in common] for name, found in by_variant.items()}
+    return {name: [run for run in runs if (run["scene"], run["seed"]) in common] for name, runs in runs_by_name.items()}
 
 
-def comparable_groups(runs: list[Run], groups: Collection[Group] = tuple(GROUPS)) -> dict[str, list[Run]]:
-    """`comparable` of the variants of some groups, and the recommended one."""
-    return comparable(runs, [name for name, v in VARIANTS.items() if v.group in groups or name == RECOMMENDED])
+def by_variant(runs: list[Run], groups: Collection[str] = GROUPS) -> dict[str, list[Run]]:
+    """Variants of some groups that have runs, the recommended one included -> their runs."""
+    names = [name for name, variant in VARIANTS.items() if variant.group in groups or name == RECOMMENDED]
+    return {name: found for name in names if (found := [run for run in runs if run["variant"] == name])}
 
 
-def upper_envelope(runs: list[Run]) -> list[tuple[int, str, float, float | None]]:
-    """At every evaluation: seconds, the best variant, its PSNR, and how far the recommended one lies below, dB."""
-    by_variant = comparable_groups(runs)
-    rows = []
-    for seconds in (s for s in EVAL_SECONDS if any(run["seconds"] >= s for run in runs)):
-        psnr = {name: value for name in by_variant if (value := mean_psnr_at(by_variant[name], seconds)) is not None}
-        if psnr:
-            best = max(psnr, key=psnr.__getitem__)
-            gap = psnr[best] - psnr[RECOMMENDED] if RECOMMENDED in psnr else None
-            rows.append((seconds, best, psnr[best], gap))
-    return rows
-
-
-def differences(runs: list[Run], first: str, second: str, seconds: float) -> dict[str, float]:
-    """Scene -> by how many dB the first variant is ahead of the second at a moment, medians over their common seeds."""
-    by_variant = comparable(runs, (first, second))
-    if len(by_variant) < 2:
-        return {}
-    ahead = {}
-    for scene in scenes_of(by_variant[first]):
-        psnr, reference = (mean_psnr_at(runs_of(by_variant[v], v, scene), seconds) for v in (first, second))
-        if psnr is not None and reference is not None:
-            ahead[scene] = psnr - reference
-    return ahead
+def psnr_over_time(runs: list[Run]) -> dict[float, dict[str, float]]:
+    """Moment -> variant -> PSNR, of the variants that have been evaluated by then."""
+    compared = comparable(by_variant(runs)).items()
+    return {
+        seconds: {name: psnr for name, found in compared if (psnr := mean_psnr_at(found, seconds)) is not None}
+        for seconds in moments_of(runs)
+    }
 
 
 def always_better(runs: list[Run]) -> list[str]:
-    """Variants ahead of the recommended one, in the mean over scenes, at every evaluation that both have."""
-    names = [name for name in VARIANTS if name != RECOMMENDED and runs_of(runs, name)]
-    ahead = {name: [differences(runs, name, RECOMMENDED, seconds) for seconds in EVAL_SECONDS] for name in names}
-    known = {name: [statistics.mean(d.values()) for d in rows if d] for name, rows in ahead.items()}
-    return [name for name, values in known.items() if values and min(values) > 0]
+    """Variants ahead of the recommended one at every evaluation that both have."""
+    rows = [psnr for psnr in psnr_over_time(runs).values() if RECOMMENDED in psnr]
+    return [name for name in (rows[-1] if rows else ()) if all(row.get(name, END) > row[RECOMMENDED] for row in rows)]
 
 
-def baseline_runs(baseline: dict[str, Any], runs: list[Run]) -> list[Run]:
-    """Another program's runs on the scenes of some runs; none if it lacks one of them."""
-    scenes = set(scenes_of(runs))
-    found = [run for run in baseline["runs"] if run["scene"] in scenes]
-    return found if scenes == set(scenes_of(found)) else []
+def differences(runs: list[Run], first: str, second: str, seconds: float) -> dict[str, float]:
+    """Scene -> by how many dB the first variant is ahead of the second at a moment, on the scenes and seeds of both."""
+    compared = comparable({name: [run for run in runs if run["variant"] == name] for name in (first, second)})
+    ahead = {}
+    for scene in scenes_of(compared.get(first, [])):
+        psnr, reference = (mean_psnr_at(runs_on(compared[name], [scene]), seconds) for name in (first, second))
+        if psnr is not None and reference is not None:
+            ahead[scene] = psnr - reference
+    return ahead

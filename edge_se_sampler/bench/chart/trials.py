@@ -12,11 +12,9 @@ import io
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -24,13 +22,12 @@ from edge_se_sampler.bench.chart.variants import VARIANTS
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.overrides import override
-from edge_se_sampler.bench.runner import Run, run_in_subprocess
-from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
+from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
-from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.ray_model import RayModel
 
@@ -62,6 +59,11 @@ class ChartSettings:
         """Seconds."""
         return time.process_time if self.threads == 1 else time.perf_counter
 
+    @property
+    def unit(self) -> str:
+        """Of the clock."""
+        return "CPU seconds on one core" if self.threads == 1 else f"seconds on {self.threads} cores"
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -77,22 +79,11 @@ class Trial:
         return f"{self.variant}-{self.scene}-{self.seed}"
 
 
-def trials(variants: Sequence[str], scenes: Sequence[str], seeds: Sequence[int]) -> list[Trial]:
-    """Seed by seed and scene by scene, so that what is compared is trained side by side; no variants: all."""
-    return [Trial(name, scene, seed) for seed, scene, name in product(seeds, scenes, variants or VARIANTS)]
-
-
 def config_of(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
     """What a trial trains; its number of iterations is still open."""
     variant = VARIANTS[trial.variant]
-    config: TrainerConfig = override(method_configs()[variant.method], variant.changes)
-    machine = MachineConfig(seed=trial.seed, device_type="cpu")  # seconds are a CPU's
-    return replace(config, data=data, output_dir=output_dir, experiment_name=trial.name, machine=machine)
-
-
-def run_trial(trial: Trial, settings: ChartSettings, data: Path) -> Run:
-    """`train_and_evaluate` in a fresh process: a process has a single peak of memory."""
-    return run_in_subprocess(train_and_evaluate, trial, settings, data)
+    run = {"data": data, "output_dir": output_dir, "machine.seed": trial.seed, "machine.device_type": "cpu"}
+    return override(method_configs()[variant.method], {**variant.changes, **run})
 
 
 def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run:
@@ -107,11 +98,11 @@ def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run
         torch.set_num_threads(settings.threads)
         memory_before = resident_memory()
         config = config_of(trial, data, Path(folder))
-        run = _train_iterations(config, iterations_within(config, settings), settings)
+        run = _train(config, iterations_within(config, settings), settings)
         ready = run["ready_seconds"]
         fitting = max(1, round(run["steps"] * (settings.seconds - ready) / (run["seconds"] - ready)))
         if abs(1 - run["planned_steps"] / fitting) > MAX_PLAN_ERROR:
-            run = _train_iterations(config, fitting, settings)
+            run = _train(config, fitting, settings)
         return {**run, "peak_bytes": max(0, resident_memory("VmHWM") - memory_before)}
 
 
@@ -134,36 +125,31 @@ def iterations_within(config: TrainerConfig, settings: ChartSettings) -> int:
     return max(PROBE_STEPS, round((settings.seconds - ready) / statistics.median(times[PROBE_STEPS // 4 :])))
 
 
-def _train_iterations(config: TrainerConfig, iterations: int, settings: ChartSettings) -> Run:
-    config = replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations)
+def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> Run:
+    """Train until the plan or the time is over, and evaluate on the way."""
     start = settings.clock()
-    trainer = prepare(config)
-    ready = round(settings.clock() - start, 3)
-    return {"planned_steps": iterations, "ready_seconds": ready} | _train(trainer, ready, settings)
-
-
-def _train(trainer: Trainer, ready: float, settings: ChartSettings) -> Run:
+    trainer = prepare(replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations))
+    ready = spent = round(settings.clock() - start, 3)
     model, pictures = trainer.pipeline.model, to_pictures(read_test_views(trainer.config))
-    counter = QueryCounter(model)
+    queries = count_queries(model)
     due = [seconds for seconds in EVAL_SECONDS if ready < seconds < settings.seconds]
-    curve, results, spent = [], {}, ready
-    for step in range(trainer.planned_steps):
+    curve, results = [], {}
+    for steps in range(1, iterations + 1):
         start = settings.clock()
-        trainer.train_iteration(step)
+        trainer.train_iteration(steps - 1)
         spent += settings.clock() - start
-        last = step + 1 == trainer.planned_steps or spent >= settings.seconds
-        if last or (due and spent >= due[0]):
+        is_last = steps == iterations or spent >= settings.seconds
+        if is_last or (due and spent >= due[0]):
             due = [seconds for seconds in due if seconds > spent]
-            queries = counter.queries
-            results = evaluate(model, pictures) if last else {"psnr": quick_psnr(model, pictures)}
-            counter.queries = queries
-            curve.append([round(spent, 3), step + 1, queries, round(results["psnr"], 3)])
-        if last:
+            queries[:] = [sum(queries)]
+            results = evaluate(model, pictures) if is_last else {"psnr": quick_psnr(model, pictures)}
+            del queries[1:]  # those of the evaluation
+            curve.append([round(spent, 3), steps, queries[0], round(results["psnr"], 3)])
+        if is_last:
             break
     outcome = measure_outcome(results, pictures, model.config.background_level)["outcome"]
-    seconds, steps, queries, _ = curve[-1]
-    run = {"psnr": results["psnr"], "outcome": outcome, "seconds": seconds, "steps": steps, "queries": queries}
-    return {**run, "curve": curve}
+    run = {"planned_steps": iterations, "ready_seconds": ready, "psnr": results["psnr"], "outcome": outcome}
+    return run | dict(zip(("seconds", "steps", "queries"), curve[-1], strict=False)) | {"curve": curve}
 
 
 def quick_psnr(model: RayModel, pictures: list[Picture]) -> float:
@@ -176,13 +162,9 @@ def quick_psnr(model: RayModel, pictures: list[Picture]) -> float:
     return statistics.mean(values)
 
 
-class QueryCounter:
-    """Counts the points at which a model's networks are evaluated."""
-
-    def __init__(self, model: Any) -> None:
-        self.queries = 0
-        for network in model.networks:
-            getattr(model, network).register_forward_hook(self._add)
-
-    def _add(self, _: torch.nn.Module, inputs: tuple[Any, ...], __: Any) -> None:
-        self.queries += len(inputs[0])
+def count_queries(model: RayModel) -> list[int]:
+    """A list that grows by the number of points whenever one of the model's networks is evaluated."""
+    counts: list[int] = []
+    for network in model.networks:
+        getattr(model, network).register_forward_hook(lambda _, inputs, __: counts.append(len(inputs[0])))
+    return counts
