@@ -13,6 +13,7 @@ from tiny import check_gradients, tiny_model, tiny_rays, with_constant_density
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.models import nerf
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
 from edge_se_sampler.occupancy.grid import OccupancyGrid
@@ -228,22 +229,22 @@ def test_the_loss_is_coarse_and_fine_error_a_mean_over_channels() -> None:
     torch.testing.assert_close(weighted, torch.tensor([2.0, 0.0]) * (coarse + fine) / 3)
 
 
-def hold_importance(model: NeRFModel) -> None:
+def hold_importance(monkeypatch: pytest.MonkeyPatch) -> None:
     """From now on the importance samples are those of the next call: no gradient flows through their positions."""
-    draw, held = model._importance, []
+    draw, held = nerf.importance, []
 
-    def first(t: Tensor, weights: Tensor) -> Tensor:
-        held.append(draw(t, weights))  # every time, as it takes its share of the random numbers
+    def first(*inputs: Tensor) -> Tensor:
+        held.append(draw(*inputs))
         return held[0]
 
-    model._importance = first
+    monkeypatch.setattr(nerf, "importance", first)
 
 
 @pytest.mark.parametrize("culled", [False, True])
-def test_gradients_of_every_layer_against_finite_differences(culled: bool) -> None:
+def test_gradients_of_every_layer_against_finite_differences(culled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     grid = ball_grid(1.5) if culled else None
     model = tiny_model(grid=grid, density_activation="softplus", density_noise=0.2, background_color="random").train()
-    hold_importance(model)
+    hold_importance(monkeypatch)
     batch = {"image": pixels(), "weight": torch.linspace(0.5, 2, RAYS, dtype=torch.float64)}
 
     def loss() -> Tensor:

@@ -45,16 +45,6 @@ class OptimizerConfig:
     fused: bool = False
     """Use torch's fused implementation: faster, and rounded a little differently."""
 
-    def check(self) -> None:
-        """Refuse values without meaning.
-
-        Raises:
-            InputError: one is out of its range.
-        """
-        check_value("optimizer.lr", self.lr, self.lr is None or 0 < self.lr < INFINITY, "above 0")
-        check_value("optimizer.final-fraction", self.final_fraction, 0 < self.final_fraction <= 1, "in (0, 1]")
-        check_value("optimizer.eps", self.eps, 0 <= self.eps < INFINITY, "at least 0")
-
 
 @dataclass(frozen=True)
 class TrainerConfig(InstantiateConfig):
@@ -100,34 +90,31 @@ class TrainerConfig(InstantiateConfig):
     @property
     def preview_interval(self) -> int:
         """Steps between previews: as given, or a tenth of the iterations."""
-        given = self.steps_per_eval_image
-        return max(1, self.preset.iterations // 10) if given is None else given
+        interval = self.steps_per_eval_image
+        return max(1, self.preset.iterations // 10) if interval is None else interval
 
     def check(self) -> None:
-        """Refuse values without meaning, in a config whose size is decided.
-
-        Raises:
-            InputError: one is out of its range, or has no effect with the others.
-        """
+        """Raise InputError if a value is out of its range or has no effect with the others; the size is decided."""
+        manager, model, optimizer = self.pipeline.datamanager, self.pipeline.model, self.optimizer
+        seconds = self.max_seconds
         at_least_one = {
             "max-num-iterations": self.max_num_iterations,
             "steps-per-save": self.steps_per_save,
             "steps-per-eval-image": self.steps_per_eval_image,
             "steps-per-log": self.steps_per_log,
-            "pipeline.datamanager.train-num-rays-per-batch": self.pipeline.datamanager.train_num_rays_per_batch,
+            "pipeline.datamanager.train-num-rays-per-batch": manager.train_num_rays_per_batch,
         }
         for flag, value in at_least_one.items():
             check_value(flag, value, value is None or value >= 1, "at least 1")
-        check_seconds(self.max_seconds)
+        check_value("max-seconds", seconds, seconds is None or 0 < seconds < INFINITY, "above 0, and finite")
         for name in (self.method_name, self.experiment_name):
             if name in ("", ".", "..") or "/" in str(name) or "\0" in str(name):
                 raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
-        self.optimizer.check()
-        self.pipeline.model.check("pipeline.model.")
-        self._check_combinations()
-
-    def _check_combinations(self) -> None:
-        manager, model = self.pipeline.datamanager, self.pipeline.model
+        lr, final = optimizer.lr, optimizer.final_fraction
+        check_value("optimizer.lr", lr, lr is None or 0 < lr < INFINITY, "above 0")
+        check_value("optimizer.final-fraction", final, 0 < final <= 1, "in (0, 1]")
+        check_value("optimizer.eps", optimizer.eps, 0 <= optimizer.eps < INFINITY, "at least 0")
+        model.check("pipeline.model.")
         if manager.skip_empty_rays and not model.needs_grid:
             raise InputError(
                 "--pipeline.datamanager.skip-empty-rays has no effect here; add "
@@ -141,15 +128,6 @@ class TrainerConfig(InstantiateConfig):
             raise InputError(
                 "--pipeline.datamanager.pixel-sampler.error-source is coarse: this model has no coarse network"
             )
-
-
-def check_seconds(seconds: float | None, flag: str = "max-seconds") -> None:
-    """Refuse a time limit that is none; None: no limit.
-
-    Raises:
-        InputError: it is not above 0 and finite.
-    """
-    check_value(flag, seconds, seconds is None or 0 < seconds < INFINITY, "above 0, and finite")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,12 @@ import torch
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.pipeline import analyze_views
-from edge_se_sampler.models.config import LeanModelConfig, size_for
+from edge_se_sampler.models.config import LeanModelConfig, decide_size
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.hull import find_hit_pixels
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
 from edge_se_sampler.sampling.edges import unit_float
 
-NUM_RAYS = 4096
-"""Rays that samples are counted along."""
 NUM_VIEWS = 3
 """Views in the picture."""
 
@@ -33,8 +30,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
         InputError: a setting is out of its range, matplotlib is missing, or the picture cannot be written.
     """
     pyplot = require_pyplot()
-    longest = max(max(image.shape[:2]) for image in views.images)
-    config = replace(config, size=size_for(longest) if config.size == "auto" else config.size)
+    config = decide_size(config, views.images)
     config.check()
     analysis = analyze_views(views, config)
     hit_pixels = find_hit_pixels(views, analysis.hull)
@@ -51,23 +47,21 @@ def _findings(
 ) -> dict[str, str]:
     """Each quantity's value, and where it comes from."""
     hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.pixel_footprint
-    num_views = len(views.images)
-    sizes = sorted({image.shape[1::-1] for image in views.images})
-    num_cells = max(
-        hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3
-    )  # large cells may reach beyond the box
-    num_occupied = hull.cells.sum()
+    num_views, num_occupied = len(views.images), hull.cells.sum()
+    sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
+    # large cells may reach beyond the box
+    num_cells = max(hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3)
     first = hull.cell_size * 2**analysis.coarsening
     finest = first / 2**analysis.max_level
-    in_hull, along_box = _samples_per_ray(views, analysis, hit_pixels, config)
+    step, pixels = config.step_size_voxels * hull.cell_size, pick_pixels(dict(enumerate(hit_pixels)))
+    rays = views.cameras.to(dtype=torch.float32).pixel_rays(pixels)
+    samples = OccupancyGrid.from_hull(hull).march(rays, step, None, (config.near, config.far))
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
     center = ", ".join(f"{value + 0.0:.2f}" for value in box.center.round(2))
     share = np.mean(np.concatenate([pixels.ravel() for pixels in hit_pixels]))
-    half_extent = float(analysis.grid().half_extent)
-    wave = 2 * np.pi * half_extent / 2 ** (preset.position_frequencies - 1) / footprint
+    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2 ** (preset.position_frequencies - 1) / footprint
     return {
-        "views": f"{num_views} of {' and '.join(f'{w} x {h}' for w, h in sizes)}, {np.median(distance):.2f} "
-        f"from what they look at, ({center})",
+        "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
         "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",
@@ -78,23 +72,12 @@ def _findings(
         f"what is finer is left to {config.feature_dim} features at every corner of a cell",
         "network": f"{preset.depth} x {preset.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size "
         f"{config.size}, by the images' longer side",
-        "rays": f"{100 * share:.1f} % of the pixels may cross them; such a ray has {in_hull:.1f} samples, "
-        f"{along_box:.0f} along all of its depth",
+        "rays": f"{100 * share:.1f} % of the pixels may cross them; such a ray has "
+        f"{len(samples.t) / len(pixels):.1f} samples, {2 * box.half_extent / step:.0f} along all of its depth",
         "sampling": "uniform among them"
         if analysis.num_silhouettes
         else "by edges as long as they pay, for nothing tells where the object is",
     }
-
-
-def _samples_per_ray(
-    views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
-) -> tuple[float, float]:
-    """Samples of a ray that crosses the hull: in its cells, a mean over some rays, and along the box's edge."""
-    step = config.step_size_voxels * analysis.hull.cell_size
-    pixels = pick_pixels(dict(enumerate(hit_pixels)), NUM_RAYS)
-    rays = views.cameras.to(dtype=torch.float32).pixel_rays(pixels)
-    samples = OccupancyGrid.from_hull(analysis.hull).march(rays, step, None, (config.near, config.far))
-    return len(samples.t) / len(pixels), 2 * analysis.box.half_extent / step
 
 
 def _draw_hull(axes: np.ndarray, analysis: SceneAnalysis) -> None:

@@ -35,10 +35,7 @@ class Pipeline:
     def build(
         cls, config: TrainerConfig, views: Views, device: str, saved_grid: OccupancyGrid | None = None
     ) -> Pipeline:
-        """Set up both for a resolved config.
-
-        Args:
-            saved_grid: the occupancy grid of the checkpoint that is resumed; None: the scene's own.
+        """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own.
 
         Raises:
             InputError: the scene is not the saved grid's.
@@ -64,22 +61,14 @@ class Pipeline:
 
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
     """`analyze_scene` with a model's settings."""
+    by_alpha, prunable = config.culls_by_alpha, config.prunes_cells
     return analyze_scene(
-        views,
-        near=config.near,
-        far=config.far,
-        voxel_size_px=config.voxel_size_px,
-        by_alpha=config.culls_by_alpha,
-        prunable=config.prunes_cells,
+        views, config.near, config.far, voxel_size_px=config.voxel_size_px, by_alpha=by_alpha, prunable=prunable
     )
 
 
 def build_model(config: TrainerConfig, device: str, grid: OccupancyGrid | None = None) -> RayModel:
-    """The model with its initial weights: a function of the seed and the size alone, whatever the method.
-
-    Args:
-        grid: of a model that needs one.
-    """
+    """The model with its initial weights: a function of the seed and the size alone, whatever the method."""
     rng = stream(config.machine.seed, 0, Stream.WEIGHTS)
     return config.pipeline.model.setup(rng=rng, grid=grid).to(device)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.models.config import apply_preset, size_for
+from edge_se_sampler.models.config import apply_preset, decide_size
 
 
 def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
@@ -18,10 +18,8 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     Raises:
         InputError: a value is out of its range.
     """
-    model, data = config.pipeline.model, config.data and config.data.resolve()
-    if model.size == "auto":
-        size = size_for(max(max(image.shape[:2]) for image in views.images))
-        config = replace(config, pipeline=replace(config.pipeline, model=replace(model, size=size)))
+    data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
+    config = replace(config, pipeline=replace(config.pipeline, model=model))
     preset = config.preset
     resolved = replace(
         config,
@@ -32,7 +30,7 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
         pipeline=replace(
             config.pipeline,
             datamanager=replace(config.pipeline.datamanager, train_num_rays_per_batch=preset.rays),
-            model=apply_preset(config.pipeline.model, preset.rays),
+            model=apply_preset(model, preset.rays),
         ),
         optimizer=replace(config.optimizer, lr=preset.learning_rate),
     )

@@ -15,7 +15,7 @@ import torch
 from edge_se_sampler.data.blender import Split, has_split, read_blender
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
-from edge_se_sampler.engine.config import TrainerConfig, check_seconds
+from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.resolve import resolve_config
@@ -53,8 +53,8 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     Raises:
         InputError: no such run, no or bad checkpoint, or its data is gone or has changed.
     """
-    check_seconds(max_seconds)
     config = dataclasses.replace(config, max_seconds=max_seconds)
+    config.check()
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
     trainer = prepare(config, run, saved_grid(state["model"]))
     trainer.resume(state)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, TypeVar
+
+import numpy as np
 
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.protocol import InstantiateConfig
@@ -54,7 +56,7 @@ class ModelConfig(InstantiateConfig):
     presets: ClassVar[Mapping[str, SizePreset]] = NERF_PRESETS
 
     size: Literal["auto", "paper", "small", "tiny"] = "auto"
-    """Networks and samples: the paper's, or smaller ones for smaller images; auto decides by the images."""
+    """Networks and samples: the paper's, or smaller ones for smaller images; auto: by the images' longest side."""
     width: int | None = None
     """Neurons of a layer."""
     depth: int | None = None
@@ -66,7 +68,7 @@ class ModelConfig(InstantiateConfig):
     initialization: Literal["xavier", "torch"] = "xavier"
     """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
     background_color: Literal["white", "black", "random"] = "white"
-    """Background of the scene; random: another colour for every training ray, white in evaluation."""
+    """Background of the scene; random: another color for every training ray, white in evaluation."""
     near: float = 2.0
     """Depth along the optical axis at which samples begin, world units."""
     far: float = 6.0
@@ -81,6 +83,11 @@ class ModelConfig(InstantiateConfig):
     def preset(self) -> SizePreset:
         """The numbers of its size, which is not auto, with those set here in their place: none is left open."""
         return self.presets[self.size].overridden_by(vars(self))
+
+    @property
+    def background_level(self) -> float:
+        """The evaluation background's red, green and blue, all the same: 0 black, 1 white."""
+        return 0.0 if self.background_color == "black" else 1.0
 
     @property
     def needs_grid(self) -> bool:
@@ -98,30 +105,21 @@ class ModelConfig(InstantiateConfig):
         return False
 
     def check(self, prefix: str = "") -> None:
-        """Refuse values without meaning, in a config whose size is decided.
+        """Raise InputError if a value is out of its range, in a config whose size is decided.
 
         Args:
             prefix: of the flags' names in the message.
-
-        Raises:
-            InputError: one is out of its range.
         """
         if not 0 <= self.near < self.far < INFINITY:
             raise InputError(f"--{prefix}near is {self.near}, --{prefix}far {self.far}: 0 <= near < far")
         size_px, preset = self.voxel_size_px, self.preset
         check_value(f"{prefix}voxel-size-px", size_px, 0 < size_px <= 1000, "above 0, at most 1000")
         check_value(f"{prefix}depth", preset.depth, preset.depth >= 1, "at least 1")
-        check_value(
-            f"{prefix}width", preset.width, preset.width >= 2, "at least 2 (the layer of the direction has half of it)"
-        )
+        width_rule = "at least 2 (the layer of the direction has half of it)"
+        check_value(f"{prefix}width", preset.width, preset.width >= 2, width_rule)
         for name in ("position", "direction"):
             frequencies = getattr(preset, f"{name}_frequencies")
             check_value(f"{prefix}{name}-frequencies", frequencies, 0 <= frequencies <= 24, "between 0 and 24")
-
-    @property
-    def background_level(self) -> float:
-        """The evaluation background's red, green and blue, all the same: 0 black, 1 white."""
-        return 0.0 if self.background_color == "black" else 1.0
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,6 @@ class NeRFModelConfig(ModelConfig):
     """Standard deviation of noise added to the raw density in training."""
 
     def check(self, prefix: str = "") -> None:
-        """As `ModelConfig`."""
         super().check(prefix)
         coarse, fine = self.preset.num_coarse_samples, self.preset.num_importance_samples
         check_value(f"{prefix}num-coarse-samples", coarse, coarse >= 3, "at least 3")
@@ -170,21 +167,17 @@ class LeanModelConfig(ModelConfig):
 
     @property
     def needs_grid(self) -> bool:
-        """Always: the features lie at its corners."""
-        return True
+        return True  # the features lie at its corners
 
     @property
     def culls_by_alpha(self) -> bool:
-        """As `ModelConfig`."""
         return self.empty_space_skipping and self.cull_by_alpha
 
     @property
     def prunes_cells(self) -> bool:
-        """As `ModelConfig`."""
         return self.empty_space_skipping and self.cull_by_density
 
     def check(self, prefix: str = "") -> None:
-        """As `ModelConfig`."""
         super().check(prefix)
         step, scale = self.step_size_voxels, self.feature_lr_scale
         check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
@@ -215,7 +208,6 @@ class InfoNeRFModelConfig(NeRFModelConfig):
     """Iterations between two such decays."""
 
     def check(self, prefix: str = "") -> None:
-        """As `ModelConfig`."""
         super().check(prefix)
         check_value(f"{prefix}num-unseen-rays", self.num_unseen_rays, self.preset.num_unseen_rays >= 0, "at least 0")
         for name in ("entropy_weight", "gain_weight", "gain_degrees", "gain_rate"):
@@ -229,21 +221,17 @@ class InfoNeRFModelConfig(NeRFModelConfig):
 Model = TypeVar("Model", bound=ModelConfig)
 
 
-def size_for(pixels_a_side: int) -> Literal["paper", "small", "tiny"]:
-    """The size that "auto" stands for: by the images' longer side."""
-    if pixels_a_side <= 128:
-        return "tiny"
-    return "small" if pixels_a_side <= 256 else "paper"
+def decide_size(config: Model, images: Iterable[np.ndarray]) -> Model:
+    """The config with size "auto" replaced by what suits the longest side of the images (H, W, 3|4)."""
+    if config.size != "auto":
+        return config
+    longest = max(max(image.shape[:2]) for image in images)
+    return replace(config, size="tiny" if longest <= 128 else "small" if longest <= 256 else "paper")
 
 
 def apply_preset(config: Model, rays: int) -> Model:
-    """A config whose size is decided, with every None replaced by the size's number.
-
-    Args:
-        rays: of a training step; as many unseen ones, where the config leaves that open.
-    """
-    preset = config.presets[config.size].overridden_by({"num_unseen_rays": rays})
-    left_open = {
-        key: getattr(preset, key) for key, value in vars(config).items() if value is None and key in vars(preset)
-    }
-    return replace(config, **left_open)
+    """A config whose size is decided, with every None replaced by the size's number; as many unseen rays as `rays`,
+    those of a training step."""
+    preset = vars(config.presets[config.size]) | {"num_unseen_rays": rays}
+    left_open = [key for key, value in vars(config).items() if value is None and key in preset]
+    return replace(config, **{key: preset[key] for key in left_open})

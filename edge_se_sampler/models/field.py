@@ -1,4 +1,4 @@
-"""The radiance field (NeRF, figure 7): position and direction -> density and colour.
+"""The radiance field (NeRF, figure 7): position and direction -> density and color.
 
 m   points that are evaluated, packed: point i lies on ray ray_indices[i]
 n   rays; what depends on the direction alone is computed once for each
@@ -19,12 +19,7 @@ SKIP_LAYER = 5
 
 
 class NeRFField(nn.Module):
-    """The MLP: `depth` layers for the position, one more for the direction.
-
-    Args:
-        config: resolved.
-        rng: of the initial weights.
-    """
+    """The MLP: `depth` layers for the position, one more for the direction. `rng` draws the initial weights."""
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
         super().__init__()
@@ -44,7 +39,7 @@ class NeRFField(nn.Module):
 
     def initialize(self, scheme: str, rng: np.random.Generator) -> None:
         """Give every layer new initial weights, see `initialize_linear`."""
-        initialize_all(self, scheme, rng)
+        initialize_linear(self, scheme, rng)
 
     def forward(self, positions: Tensor, directions: Tensor, ray_indices: Tensor | None, noise: Tensor | None = None):
         """Evaluate points.
@@ -56,7 +51,7 @@ class NeRFField(nn.Module):
             noise: (m,) added to the raw density, or None.
 
         Returns:
-            density (m,) >= 0, colour (m, 3) in [0, 1].
+            density (m,) >= 0, color (m, 3) in [0, 1].
         """
         encoded = positional_encoding(positions, self.position_frequencies)
         h = encoded
@@ -89,23 +84,18 @@ def linear(in_size: int, out_size: int) -> nn.Linear:
     return layer
 
 
-def initialize_all(field: nn.Module, scheme: str, rng: np.random.Generator) -> None:
-    """Give every linear layer of a module initial weights, see `initialize_linear`."""
-    for layer in field.modules():
-        if isinstance(layer, nn.Linear):
-            initialize_linear(layer, scheme, rng)
-
-
-def initialize_linear(layer: nn.Linear, scheme: str, rng: np.random.Generator) -> None:
-    """Draw a layer's initial weights.
+@torch.no_grad()
+def initialize_linear(module: nn.Module, scheme: str, rng: np.random.Generator) -> None:
+    """Draw the initial weights of a module's linear layers.
 
     Scheme "xavier": uniform in +-sqrt(6 / (in + out)), zero bias, as the original TensorFlow NeRF; "torch": weight and
     bias uniform in +-1 / sqrt(in), what the PyTorch ports start from.
     """
-    out_size, in_size = layer.weight.shape
-    bound = (6 / (in_size + out_size)) ** 0.5 if scheme == "xavier" else in_size**-0.5
-    with torch.no_grad():
-        layer.weight.copy_(torch.from_numpy(rng.uniform(-bound, bound, (out_size, in_size))))
-        layer.bias.zero_()
-        if scheme == "torch":
-            layer.bias.copy_(torch.from_numpy(rng.uniform(-bound, bound, out_size)))
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            out_size, in_size = layer.weight.shape
+            bound = (6 / (in_size + out_size)) ** 0.5 if scheme == "xavier" else in_size**-0.5
+            layer.weight.copy_(torch.from_numpy(rng.uniform(-bound, bound, (out_size, in_size))))
+            layer.bias.zero_()
+            if scheme == "torch":
+                layer.bias.copy_(torch.from_numpy(rng.uniform(-bound, bound, out_size)))

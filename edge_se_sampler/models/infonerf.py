@@ -69,7 +69,7 @@ def rotate_rays(rays: RayBundle, rotation: Tensor) -> RayBundle:
 
 
 class InfoNeRFModel(NeRFModel):
-    """NeRF with ray entropy minimisation on unseen rays and information gain reduction on all."""
+    """NeRF with ray entropy minimization on unseen rays and information gain reduction on all."""
 
     config: InfoNeRFModelConfig
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.encoding import encoded_size, positional_encoding
-from edge_se_sampler.models.field import initialize_all, linear
+from edge_se_sampler.models.field import initialize_linear, linear
 from edge_se_sampler.models.packed_rendering import (
     accumulate_along_rays,
     expand_to_samples,
@@ -48,12 +48,7 @@ MISSED_FRACTION = 0.01
 
 
 class LeanField(nn.Module):
-    """Position, features and direction -> density and colour.
-
-    Args:
-        config: resolved.
-        rng: of the initial weights.
-    """
+    """Position, features and direction -> density and color. `rng` draws the initial weights."""
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator) -> None:
         super().__init__()
@@ -65,7 +60,7 @@ class LeanField(nn.Module):
         self.density = linear(width, 1)
         self.view = linear(width + encoded_size(3, self.direction_frequencies), width)
         self.color = linear(width, 3)
-        initialize_all(self, config.initialization, rng)
+        initialize_linear(self, config.initialization, rng)
 
     def forward(
         self, positions: Tensor, features: Tensor, directions: Tensor, ray_starts: Tensor, ray_indices: Tensor
@@ -79,7 +74,7 @@ class LeanField(nn.Module):
             ray_starts, ray_indices: (n,) and (m,) int64, see `Samples`.
 
         Returns:
-            raw density (m,), colour (m, 3) in [0, 1].
+            raw density (m,), color (m, 3) in [0, 1].
         """
         h = torch.cat((positional_encoding(positions, self.position_frequencies), features), dim=1)
         for layer in self.layers:
@@ -93,13 +88,8 @@ class LeanField(nn.Module):
 
 
 class LeanModel(RayModel):
-    """One network, evaluated in occupied cells alone.
-
-    Args:
-        config: resolved.
-        rng: of the initial weights.
-        grid: the scene's cells; features lie at their corners. Training prunes and subdivides them.
-    """
+    """One network, evaluated in the grid's occupied cells alone; features lie at their corners. Training prunes and
+    subdivides them. `rng` draws the initial weights."""
 
     config: LeanModelConfig
     grid: OccupancyGrid
@@ -115,13 +105,12 @@ class LeanModel(RayModel):
 
     @property
     def rays_per_chunk(self) -> int:
-        """As `RayModel`."""
         return 4096
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
-        """The features learn faster than the network: each sees few samples."""
         if self.features is None:
             return super().parameter_groups()
+        # the features learn faster than the network: each sees few samples
         return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_lr_scale)]
 
     def begin_step(self, step: int, seed: int) -> None:

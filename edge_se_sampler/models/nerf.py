@@ -1,4 +1,4 @@
-"""The original NeRF: rays -> colours, by a coarse and a fine network."""
+"""The original NeRF: rays -> colors, by a coarse and a fine network."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ another (equally good) training run."""
 
 
 class NeRFModel(RayModel):
-    """Coarse and fine networks, stratified and importance samples.
-
-    Args:
-        config: resolved.
-        rng: of the initial weights.
-        grid: outside of its occupied cells the density is 0, and no network is evaluated; None: everywhere.
-    """
+    """Coarse and fine networks, stratified and importance samples. `rng` draws the initial weights."""
 
     networks = ("coarse", "fine")
 
@@ -40,7 +34,6 @@ class NeRFModel(RayModel):
 
     @property
     def rays_per_chunk(self) -> int:
-        """As `RayModel`."""
         points_per_ray = 2 * self.num_coarse_samples + self.num_importance_samples
         return max(1, POINTS_PER_CHUNK.get(self.device.type, 2**14) // points_per_ray)
 
@@ -49,7 +42,11 @@ class NeRFModel(RayModel):
         t, weights, rgb, background = self._coarse(rays)
         outputs = {"rgb_coarse": rgb, "accumulation_coarse": weights.sum(1, keepdim=True), "background": background}
 
-        t = torch.sort(torch.cat((t, self._importance(t, weights.detach())), dim=1)).values
+        count = self.num_importance_samples
+        even = torch.linspace(0, 1, count, dtype=t.dtype, device=t.device).expand(len(t), count)
+        uniform = self.uniform(len(t), count) if self.training else even
+        further = importance((t[:, 1:] + t[:, :-1]) / 2, weights.detach()[:, 1:-1], uniform)
+        t = torch.sort(torch.cat((t, further), dim=1)).values
         weights, rgb, samples = self._render(self.fine, rays, t, background)
         accumulation = weights.sum(1, keepdim=True)
         depth = (weights * t).sum(1, keepdim=True) + (1 - accumulation) * t[:, -1:]
@@ -57,12 +54,12 @@ class NeRFModel(RayModel):
         return outputs | fine | dict(zip(("density_fine", "delta_fine"), samples, strict=True))
 
     def coarse_squared_error(self, rays: RayBundle, image: Tensor) -> Tensor:
-        """(n,) `squared_error` of the coarse colours, without evaluating the fine network."""
+        """(n,) `squared_error` of the coarse colors, without evaluating the fine network."""
         _, _, rgb, background = self._coarse(rays)
         return self.squared_error({"rgb_coarse": rgb, "background": background}, image, "coarse")
 
     def _coarse(self, rays: RayBundle) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Render by the coarse network: t and weights of its samples (n, s), colours and backgrounds (n, 3)."""
+        """Render by the coarse network: t and weights of its samples (n, s), colors and backgrounds (n, 3)."""
         norm = rays.metadata["directions_norm"]
         jitter = self.uniform(len(rays), self.num_coarse_samples) if self.training else None
         t = stratified(self.config.near * norm, self.config.far * norm, self.num_coarse_samples, jitter)
@@ -70,21 +67,15 @@ class NeRFModel(RayModel):
         weights, rgb, _ = self._render(self.coarse, rays, t, background)
         return t, weights, rgb, background
 
-    def _importance(self, t: Tensor, weights: Tensor) -> Tensor:
-        """(n, m) further samples where the coarse weights (n, s) of the samples t (n, s) are large."""
-        count = self.num_importance_samples
-        if self.training:
-            uniform = self.uniform(len(t), count)
-        else:
-            uniform = torch.linspace(0, 1, count, dtype=t.dtype, device=t.device).expand(len(t), count)
-        return importance((t[:, 1:] + t[:, :-1]) / 2, weights[:, 1:-1], uniform)
-
     def _render(
         self, field: NeRFField, rays: RayBundle, t: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """Weights (n, s), colours (n, 3), and (densities, intervals) (n, s) of rays sampled at t (n, s)."""
+        """Weights (n, s), colors (n, 3), and (densities, intervals) (n, s) of rays sampled at t (n, s)."""
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
-        noise = self._noise(t.numel())
+        noise = None
+        if self.training and self.config.density_noise:
+            noise = torch.randn(t.numel(), generator=self.random, device=self.device, dtype=self.dtype)
+            noise = noise * self.config.density_noise
         if self.grid is None:
             density, color = field(positions, rays.directions, None, noise)
         else:
@@ -99,10 +90,3 @@ class NeRFModel(RayModel):
         density = density.reshape(t.shape)
         weights = sample_weights(density, delta)
         return weights, composite(weights, color.reshape(*t.shape, 3), background), (density, delta)
-
-    def _noise(self, count: int) -> Tensor | None:
-        """(count,) noise on the raw density, in training only."""
-        if not (self.training and self.config.density_noise):
-            return None
-        noise = torch.randn(count, generator=self.random, device=self.device, dtype=self.dtype)
-        return noise * self.config.density_noise

@@ -4,11 +4,11 @@ n, m   rays; samples of all rays one after the other, those of a ray by ascendin
 tau    sigma delta, optical depth of a sample
 T      exp(-sum of the tau before it on its ray), transmittance
 w      T (1 - exp(-tau)), weight
-g      gradient of the loss by a ray's (colour, accumulation)
+g      gradient of the loss by a ray's (color, accumulation)
 s      w (c, 1) . g: what a sample contributes to the loss, to first order
 
 d loss / d c_i = w_i g, and d loss / d tau_i = T_i exp(-tau_i) (c_i, 1) . g - (sum of the s_j after i): more depth at
-i shows more of its own colour and less of everything after it. Sums along a ray are differences of one running sum,
+i shows more of its own color and less of everything after it. Sums along a ray are differences of one running sum,
 in float64, for it runs over all rays.
 """
 
@@ -23,7 +23,7 @@ from torch import Tensor
 def render_packed(
     density: Tensor, color: Tensor, step: float, ray_starts: Tensor, ray_indices: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Colours (n, 3) in front of black and accumulations (n, 1).
+    """Colors (n, 3) in front of black and accumulations (n, 1).
 
     Args:
         density: (m,) >= 0, per world unit.
@@ -70,7 +70,7 @@ class _ExpandToSamples(torch.autograd.Function):
 
 
 class _Render(torch.autograd.Function):
-    """tau (m,), colour (m, 3) -> colour and accumulation (n, 4)."""
+    """tau (m,), color (m, 3) -> color and accumulation (n, 4)."""
 
     @staticmethod
     def forward(ctx: Any, tau: Tensor, color: Tensor, ray_starts: Tensor, ray_indices: Tensor) -> Tensor:

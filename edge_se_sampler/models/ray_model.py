@@ -1,4 +1,4 @@
-"""The contract of every model with training, evaluation and samplers: rays -> colours and their errors."""
+"""The contract of every model with training, evaluation and samplers: rays -> colors and their errors."""
 
 from __future__ import annotations
 
@@ -14,15 +14,11 @@ from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 
 class RayModel(nn.Module, ABC):
-    """Renders rays.
-
-    Args:
-        config: resolved, without None.
-        grid: cells outside of which no network is evaluated; None: there are none.
-    """
+    """Renders rays, by a resolved config; outside the occupied cells of its grid, if it has one, no network is
+    evaluated, and the density is 0."""
 
     networks: tuple[str, ...] = ("fine",)
-    """Names of the networks, each an attribute; the colours of "fine" are the model's."""
+    """Names of the networks, each an attribute; the colors of "fine" are the model's."""
     num_unseen_rays = 0
     """Rays a step, of cameras between the training views, that `auxiliary_loss` regularizes."""
 
@@ -33,16 +29,14 @@ class RayModel(nn.Module, ABC):
         self.random = torch.Generator()
         """Source of jitter, noise and random backgrounds; seeded at every training step."""
         self.background_fn: Callable[[RayBundle], Tensor] | None = None
-        """n rays -> (n, 3) background colours in [0, 1], in place of the config's background color."""
+        """n rays -> (n, 3) background colors in [0, 1], in place of the config's background color."""
 
     @property
     def device(self) -> torch.device:
-        """The device of the weights."""
         return next(self.parameters()).device
 
     @property
     def dtype(self) -> torch.dtype:
-        """The floating point type of the weights."""
         return next(self.parameters()).dtype
 
     @property
@@ -61,7 +55,7 @@ class RayModel(nn.Module, ABC):
 
         Returns:
             rgb_NETWORK (n, 3) and accumulation_NETWORK (n, 1) of each network; depth_fine (n, 1), world units along the
-            ray; background (n, 3), the colours that the rays are composited on.
+            ray; background (n, 3), the colors that the rays are composited on.
         """
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
@@ -84,7 +78,7 @@ class RayModel(nn.Module, ABC):
         return (outputs[f"rgb_{network}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Render n rays: their losses (n,), whose mean is minimised, and the fine network's squared errors (n,)."""
+        """Render n rays: their losses (n,), whose mean is minimized, and the fine network's squared errors (n,)."""
         return self.loss(self(rays), batch)
 
     def auxiliary_loss(self, rays: RayBundle) -> Tensor:
@@ -103,7 +97,7 @@ class RayModel(nn.Module, ABC):
         return (error * batch["weight"] / 3 if "weight" in batch else error / 3), fine.detach()
 
     def get_background(self, rays: RayBundle) -> Tensor:
-        """(n, 3) background colours of n rays, in [0, 1]."""
+        """(n, 3) background colors of n rays, in [0, 1]."""
         if self.background_fn is not None:
             return self.background_fn(rays)
         if self.training and self.config.background_color == "random":
@@ -116,7 +110,7 @@ class RayModel(nn.Module, ABC):
 
 
 def target_colors(image: Tensor, background: Tensor) -> Tensor:
-    """The colours (n, 3) that rays should have: pixels (n, 3|4), straight alpha, composited on backgrounds (n, 3)."""
+    """The colors (n, 3) that rays should have: pixels (n, 3|4), straight alpha, composited on backgrounds (n, 3)."""
     if image.shape[1] == 3:
         return image
     return image[:, :3] * image[:, 3:] + background * (1 - image[:, 3:])

@@ -1,4 +1,4 @@
-"""Volume rendering (NeRF, equations 3 and 5): densities and colours along a ray -> its colour.
+"""Volume rendering (NeRF, equations 3 and 5): densities and colors along a ray -> its color.
 
 n, s   rays, samples along a ray
 t      distance of a sample from the origin, (n, s), ascending
@@ -38,7 +38,7 @@ def opacity(sigma: Tensor, delta: Tensor) -> Tensor:
 
 
 def composite(weights: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-    """Colours of rays in front of a background.
+    """Colors of rays in front of a background.
 
     Args:
         weights: (n, s).

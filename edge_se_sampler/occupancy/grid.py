@@ -205,7 +205,7 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def prune(self, min_density: float, reactivated: Tensor) -> Tensor:
-        """Keep occupied only cells where more than min_density was seen since the last pruning, their neighbours (a
+        """Keep occupied only cells where more than min_density was seen since the last pruning, their neighbors (a
         surface may move), and those to be reactivated.
 
         Args:

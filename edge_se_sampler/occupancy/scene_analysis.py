@@ -20,8 +20,6 @@ MAX_MISSED_FRACTION = 0.01
 """Share of the foreground's pixels whose rays may miss a carved hull: stray ones do."""
 COARSENING = 1
 """How often a carved hull's cells are doubled where training subdivides them."""
-NUM_CHECKED_PIXELS = 4096
-"""Foreground pixels whose rays are tested against the hull."""
 ROUGH_RESOLUTION = 64
 """Cells along the box of a first hull, by which the number of finer ones is estimated."""
 
@@ -48,7 +46,7 @@ class SceneAnalysis:
 
 
 def analyze_scene(
-    views: Views, *, near: float, far: float, voxel_size_px: float, by_alpha: bool, prunable: bool
+    views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool, prunable: bool
 ) -> SceneAnalysis:
     """Derive the cells of a scene from its training views.
 
@@ -69,11 +67,8 @@ def analyze_scene(
     silhouettes = find_silhouettes(views) if by_alpha else {}
     hull = _bounded_hull(views, silhouettes, box, cell_size, MAX_OCCUPIED_CELLS if silhouettes else max_uncarved)
     if silhouettes and (hull is None or _missed_fraction(views, silhouettes, hull) > MAX_MISSED_FRACTION):
-        print(
-            "the views' alpha masks do not agree on where the object is, or show too little of it: they carve nothing "
-            "away",
-            file=sys.stderr,
-        )
+        problem = "do not agree on where the object is, or show too little of it: they carve nothing away"
+        print(f"the views' alpha masks {problem}", file=sys.stderr)
         silhouettes, hull = {}, _bounded_hull(views, {}, box, cell_size, max_uncarved)
     if hull is None:
         raise InputError(
@@ -81,14 +76,11 @@ def analyze_scene(
             f"({', '.join(f'{x:.2f}' for x in box.center)}): check the cameras' poses and principal points"
         )
     coarsening = COARSENING if prunable and silhouettes else 0
-    max_level = coarsening or (_max_level(hull, cell_size) if prunable else 0)
+    max_level = coarsening
+    if prunable and not silhouettes:
+        wanted, possible = np.log2(hull.cell_size / cell_size), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3
+        max_level = max(0, int(min(np.round(wanted), np.floor(possible))))
     return SceneAnalysis(box, footprint, len(silhouettes), hull, coarsening, max_level)
-
-
-def _max_level(hull: Hull, cell_size: float) -> int:
-    """How often the hull's cells are to be subdivided to have that size, as far as the grid does not get too large."""
-    wanted, possible = np.log2(hull.cell_size / cell_size), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3
-    return max(0, int(min(np.round(wanted), np.floor(possible))))
 
 
 def _bounded_hull(
@@ -103,14 +95,14 @@ def _bounded_hull(
 
 
 def _missed_fraction(views: Views, silhouettes: dict[int, Silhouette], hull: Hull) -> float:
-    """Share of the foreground's pixels whose rays miss the hull, estimated on some of them."""
-    pixels = pick_pixels({i: views.images[i][..., 3] > 0 for i in silhouettes}, NUM_CHECKED_PIXELS)
+    """Share of the foreground's pixels whose rays miss the hull, estimated on 4096 of them."""
+    pixels = pick_pixels({i: views.images[i][..., 3] > 0 for i in silhouettes})
     rays = views.cameras.to(dtype=torch.float32).pixel_rays(pixels)
     hit = OccupancyGrid.from_hull(hull).march(rays, hull.cell_size / 4, None).ray_indices
     return 1 - len(hit.unique()) / len(pixels)
 
 
-def pick_pixels(masks: Mapping[int, np.ndarray], max_pixels: int) -> torch.Tensor:
+def pick_pixels(masks: Mapping[int, np.ndarray], max_pixels: int = 4096) -> torch.Tensor:
     """Pixels in masks (H, W) by image index, evenly spread and at most so many: (n, 3) int64 image, row, column."""
     counts = [np.count_nonzero(mask) for mask in masks.values()]
     ends = np.cumsum(counts)
