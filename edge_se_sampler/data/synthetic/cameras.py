@@ -84,8 +84,9 @@ def framing(size: int, placement: Placement = "centered", offset: tuple[float, f
     """Places the object `offset` (right, down; fractions of the image's side) from the middle of size x size pixels.
 
     "centered" ignores the offset. "shifted" shows the centered picture of a smaller frame, pasted whole pixels away,
-    by moving the principal point; "padded" pastes it in the middle, so that only the position differs. "rotated" rotates
-    the cameras until the world's origin is at the shifted pixel; perspective then stretches the object.
+    by moving the principal point; "padded" pastes it in the middle, so that only the position differs. "rotated"
+    rotates the cameras until the world's origin is at the shifted pixel: every loader reads that, but perspective
+    stretches the object.
 
     Raises:
         InputError: `size` below 8, an unknown placement, or an offset that leaves the object a frame of fewer than 8
@@ -117,9 +118,7 @@ def poses(split: Split, count: int, seed: int = 0) -> list[Array]:
     """
     if split == "test":
         revolutions = [index / _GOLDEN_RATIO % 1 for index in range(count)]
-        angles = [
-            (revolution, math.radians(30 + 15 * math.sin(4 * math.pi * revolution))) for revolution in revolutions
-        ]
+        angles = [(r, math.radians(30 + 15 * math.sin(4 * math.pi * r))) for r in revolutions]
     else:
         drawn = np.random.RandomState(seed + _SEED_OFFSET[split]).rand(count, 2).tolist()
         # Short of the horizon, and of the pole, where "up" has no direction in the image.
