@@ -40,11 +40,12 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 @dataclass(frozen=True)
 class _Frame:
-    """An entry of `frames`, checked as far as the json alone allows."""
+    """An entry of `frames`, checked as far as possible without reading its images."""
 
     location: SourceLocation
     file_path: str
-    mask_path: str | None
+    image: SourceFile
+    mask: SourceFile | None
     pose: np.ndarray
     """(3, 4) float64, camera to world."""
     intrinsics: dict[str, JsonValue]
@@ -76,23 +77,19 @@ def read_blender(folder: Path, split: Split) -> Views:
     whole.
 
     Raises:
-        InputError: in one line, anything that cannot be used, first of the folder, then of the json, then of the
-            paths, and only then of the images.
+        InputError: in one line, anything that cannot be used: first of the folder, then of the json and the paths it
+            lists, and only then of the images.
     """
     folder = Path(folder)
     _check_folder(folder, split)
     top = read_json(transforms_path(folder, split))
-    frames = _read_frames(top)
+    frames = _read_frames(top, folder)
     half_tan = _read_half_tan(top, frames)
-    files = [_locate(frame.file_path, frame.location.member("file_path"), folder) for frame in frames]
-    _check_distinct(files)
-    mask_files = [
-        None if frame.mask_path is None else _locate(frame.mask_path, frame.location.member("mask_path"), folder)
-        for frame in frames
-    ]
+    _check_distinct([frame.image for frame in frames])
     with ThreadPoolExecutor() as pool:  # decoding releases Python's lock
-        images = tuple(pool.map(read_image, files))
-        _check_sizes(frames, files, images)
+        images = tuple(pool.map(read_image, [frame.image for frame in frames]))
+        _check_sizes(frames, images)
+        mask_files = [frame.mask for frame in frames]
         masks = tuple(pool.map(_read_mask, mask_files, images)) if any(mask_files) else None
     if masks is not None and not any(mask.any() for mask in masks):
         hint = "masks are non-zero where to train"
@@ -118,23 +115,24 @@ def _check_folder(folder: Path, split: str) -> None:
     raise location.error(f"has no {transforms_path(folder, split).name}, {others}", hint)
 
 
-def _read_frames(top: JsonValue) -> list[_Frame]:
+def _read_frames(top: JsonValue, folder: Path) -> list[_Frame]:
     hint = "list each view as {file_path, transform_matrix}"
     frames = top.required("frames", hint)
     entries = frames.list()
     if not entries:
         raise frames.location.error("is empty", hint)
     shared = _read_intrinsics(top)
-    return [_read_frame(entry, shared) for entry in entries]
+    return [_read_frame(entry, shared, folder) for entry in entries]
 
 
-def _read_frame(entry: JsonValue, shared: dict[str, JsonValue]) -> _Frame:
+def _read_frame(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) -> _Frame:
     file_path = entry.required("file_path", "write the image's path, relative to the folder, without .png")
     mask_path = entry.optional("mask_path")
     return _Frame(
         location=entry.location,
         file_path=file_path.file_path(),
-        mask_path=None if mask_path is None else mask_path.file_path(),
+        image=_locate(file_path, folder),
+        mask=None if mask_path is None else _locate(mask_path, folder),
         pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),
         intrinsics=shared | _read_intrinsics(entry),
     )
@@ -147,12 +145,9 @@ def _read_intrinsics(parent: JsonValue) -> dict[str, JsonValue]:
         if coefficient is not None and coefficient.number() != 0:
             problem = f"is {quote(coefficient.value)}, but lens distortion is not supported"
             raise coefficient.location.error(problem, "undistort the images, and leave it out")
-    stated = {}
-    for key, check in _INTRINSICS.items():
-        value = parent.optional(key)
-        if value is not None:
-            check(value)
-            stated[key] = value
+    stated = {key: value for key in _INTRINSICS if (value := parent.optional(key))}
+    for key, value in stated.items():
+        _INTRINSICS[key](value)
     return stated
 
 
@@ -166,18 +161,11 @@ def _read_pose(matrix: JsonValue) -> np.ndarray:
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > _LAST_ROW_TOLERANCE:
         problem = f"its last row must be [0, 0, 0, 1], not {quote(rows[3].value)}"
         raise matrix.location.error(problem, "put the translation in the last column (transposed?)")
-    if not _is_rotation(pose[:3, :3]):
+    r = pose[:3, :3].clip(-2, 2)  # no rotation has entries beyond 1, and products of large ones overflow
+    if np.abs(r.T @ r - np.eye(3)).max() > _RIGID_TOLERANCE or np.linalg.det(r) < 0:
         hint = "its upper left 3x3 must be orthonormal with determinant +1: remove scale, shear and mirroring"
         raise matrix.location.error("is not a rigid motion", hint)
     return pose[:3]
-
-
-def _is_rotation(r: np.ndarray) -> bool:
-    """Whether (3, 3) `r` is orthonormal and no mirroring, up to rounding."""
-    if np.abs(r).max() > 2:  # no rotation has such entries, and the products below might overflow
-        return False
-    off = np.abs(r.T @ r - np.eye(3)).max()
-    return bool(off <= _RIGID_TOLERANCE and np.linalg.det(r) > 0)
 
 
 def _read_half_tan(top: JsonValue, frames: Sequence[_Frame]) -> float:
@@ -196,15 +184,15 @@ def _read_half_tan(top: JsonValue, frames: Sequence[_Frame]) -> float:
     return math.tan(angle.number() / 2)
 
 
-def _locate(name: str, location: SourceLocation, folder: Path) -> SourceFile:
+def _locate(name: JsonValue, folder: Path) -> SourceFile:
     """The file that `name` means; InputError if that lies outside `folder`, be it through a link."""
-    if os.path.isabs(name):
-        raise location.error(f"{quote(name)} is an absolute path", "write it relative to the folder")
-    listed = listed_file(name)
-    path = Path(os.path.realpath(folder / listed))
-    if not path.is_relative_to(os.path.realpath(folder)):
-        raise location.error(f"{quote(listed)} leads out of the folder", "put the file into the folder")
-    return SourceFile(path, location, listed)
+    if os.path.isabs(name.file_path()):
+        raise name.location.error(f"{quote(name.value)} is an absolute path", "write it relative to the folder")
+    listed = listed_file(name.value)
+    file = SourceFile(Path(os.path.realpath(folder / listed)), name.location, listed)
+    if not file.path.is_relative_to(os.path.realpath(folder)):
+        raise file.error("leads out of the folder", "put the file into the folder")
+    return file
 
 
 def _check_distinct(files: Sequence[SourceFile]) -> None:
@@ -216,20 +204,19 @@ def _check_distinct(files: Sequence[SourceFile]) -> None:
             raise file.error(f"is already the image of {other.location.field}", "list every image once")
 
 
-def _check_sizes(frames: Sequence[_Frame], files: Sequence[SourceFile], images: Sequence[np.ndarray]) -> None:
+def _check_sizes(frames: Sequence[_Frame], images: Sequence[np.ndarray]) -> None:
     """Raise InputError for an image whose size is neither the stated one nor, where none is stated, the first's."""
     for axis, key in enumerate(("h", "w")):
-        for frame, file, image in zip(frames, files, images, strict=True):
-            height, width = image.shape[:2]
-            found = f"is {width} x {height} pixels"
+        for frame, image in zip(frames, images, strict=True):
+            found = f"is {image.shape[1]} x {image.shape[0]} pixels"
             stated = frame.intrinsics.get(key)
             if stated and stated.count() != image.shape[axis]:
-                problem = f"is {stated.count()}, but {quote(file.name)} {found}"
+                problem = f"is {stated.count()}, but {quote(frame.image.name)} {found}"
                 raise stated.location.error(problem, f"correct {key} in the file or in the frame, or the image")
             if not stated and image.shape[axis] != images[0].shape[axis]:
-                first_height, first_width = images[0].shape[:2]
+                height, width = images[0].shape[:2]
                 hint = "give the frame its own w and h, or the image that size"
-                raise file.error(f"{found}, the first image {first_width} x {first_height}", hint)
+                raise frame.image.error(f"{found}, the first image {width} x {height}", hint)
 
 
 def _read_mask(file: SourceFile | None, image: np.ndarray) -> np.ndarray:

@@ -134,17 +134,12 @@ def image_batch(views: Views) -> dict[str, Any]:
     if not views.images:
         raise InputError("there are no training views; transforms_train.json must list at least one frame")
     channels = max(image.shape[2] for image in views.images)
-    images = [torch.from_numpy(_with_channels(image, channels)) for image in views.images]
+    images = [torch.from_numpy(image) for image in views.images]
+    if any(image.shape[2] < channels for image in images):
+        images = [torch.nn.functional.pad(image, (0, channels - image.shape[2]), value=255) for image in images]
     batch: dict[str, Any] = {"image": images}
     if views.masks is not None:
         batch["mask"] = [torch.from_numpy(mask)[..., None] for mask in views.masks]
     if len({image.shape for image in images}) == 1:
         batch = {key: torch.stack(value) for key, value in batch.items()}
     return batch | {"image_idx": torch.arange(len(images))}
-
-
-def _with_channels(image: np.ndarray, channels: int) -> np.ndarray:
-    """Opaque alpha added to an RGB image among RGBA ones."""
-    if image.shape[2] == channels:
-        return image
-    return np.concatenate((image, np.full_like(image[..., :1], 255)), axis=2)

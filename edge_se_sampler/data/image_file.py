@@ -9,6 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from edge_se_sampler.data.source_location import SourceFile, quote
+from edge_se_sampler.errors import InputError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
@@ -33,26 +34,17 @@ def read_image(file: SourceFile) -> np.ndarray:
     if data.startswith(_PNG):
         _check_png(data, file)
     try:
-        pixels, mode = _decode(data)
-    except MemoryError:
+        with iio.imopen(data, "r", plugin="pillow") as opened:  # once: immeta() and imread() would each decode it
+            image: Any = opened  # its plugin's read() has a mode that the declared base has not
+            metadata = image.metadata(index=0)
+            mode = metadata["mode"]
+            if mode not in _MODES:
+                raise file.error(f"has colors of kind {mode}", "save it as 8-bit RGB or RGBA")
+            return image.read(index=0, mode="RGBA" if "transparency" in metadata else _MODES[mode])
+    except (InputError, MemoryError):
         raise
     except Exception as error:  # pillow raises OSError, SyntaxError, ValueError, struct.error, ... on bad files
         raise file.error(f"cannot be decoded, truncated or damaged ({quote(str(error))})", _COPY_AGAIN) from None
-    if pixels is None:
-        raise file.error(f"has colors of kind {mode}", "save it as 8-bit RGB or RGBA")
-    return pixels
-
-
-def _decode(data: bytes) -> tuple[np.ndarray | None, str]:
-    """Pixels and pillow's mode of a file's bytes; no pixels if the mode is not in _MODES."""
-    with iio.imopen(data, "r", plugin="pillow") as opened:  # once: immeta() and imread() would each decode it
-        image: Any = opened  # its plugin's read() has a mode that the declared base has not
-        metadata = image.metadata(index=0)
-        stored = metadata["mode"]
-        if stored not in _MODES:
-            return None, stored
-        mode = "RGBA" if "transparency" in metadata else _MODES[stored]
-        return image.read(index=0, mode=mode), stored
 
 
 def _check_png(data: bytes, file: SourceFile) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,21 +88,21 @@ def read_json(path: Path) -> JsonValue:
         raise location.error("is nested too deeply", "a list of frames is expected, each an object") from None
     except ValueError:  # Python's limit on the digits of an integer
         raise location.error("has an integer of thousands of digits", "write numbers that fit a double") from None
-    for bad in _not_finite(value, location):
-        raise bad.error("is NaN, Infinity or too large a number", "every number in the file must be finite")
     top = JsonValue(value, location)
+    _check_finite(top)
     top.object()
     return top
 
 
-def _not_finite(value: object, location: SourceLocation) -> Iterator[SourceLocation]:
-    """The locations of NaN, Infinity and 1e400, which Python's json lets through."""
-    pending = [(value, location)]  # not recursive: the nesting may be deeper than Python's stack
+def _check_finite(top: JsonValue) -> None:
+    """Raise InputError for NaN, Infinity and 1e400, which Python's json lets through."""
+    pending = [top]  # not recursive: the nesting may be deeper than Python's stack
     while pending:
-        value, location = pending.pop()
-        if isinstance(value, float) and not math.isfinite(value):
-            yield location
-        elif isinstance(value, dict):
-            pending.extend((item, location.member(key)) for key, item in value.items())
-        elif isinstance(value, list):
-            pending.extend((item, location.item(i)) for i, item in enumerate(value))
+        entry = pending.pop()
+        if isinstance(entry.value, dict):
+            pending += [JsonValue(item, entry.location.member(key)) for key, item in entry.value.items()]
+        elif isinstance(entry.value, list):
+            pending += entry.list()
+        elif isinstance(entry.value, float) and not math.isfinite(entry.value):
+            problem = "is NaN, Infinity or too large a number"
+            raise entry.location.error(problem, "every number in the file must be finite")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import reprlib
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 
 from edge_se_sampler.errors import InputError
-
-_MAX_PATH = 300  # characters of a path worth printing; its end says more than its start
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = _short.maxlong = 80
@@ -21,13 +17,6 @@ _short.maxlevel = 3
 def quote(value: object) -> str:
     """`value` for an error message: escaped by repr, shortened, on one line."""
     return _short.repr(value)
-
-
-def printable_path(path: Path | str) -> str:
-    """A path for an error message: bare if printable, else escaped; an overlong one keeps its end."""
-    text = str(path)
-    text = text if text.isprintable() else repr(text)[1:-1]
-    return text if len(text) <= _MAX_PATH else "..." + text[-_MAX_PATH:]
 
 
 @dataclass(frozen=True)
@@ -48,9 +37,11 @@ class SourceLocation:
         return SourceLocation(self.file, f"{self.field}[{index}]")
 
     def error(self, problem: str, hint: str) -> InputError:
-        """The error "<file>: <field>: <problem>; <hint>"; `hint` says what to do."""
-        location = ": ".join(filter(None, (printable_path(self.file), self.field)))
-        return InputError(f"{location}: {problem}; {hint}")
+        """The error "<file>: <field>: <problem>; <hint>", in one line; `hint` says what to do."""
+        file = str(self.file)
+        file = file if file.isprintable() else repr(file)[1:-1]
+        file = file if len(file) <= 300 else "..." + file[-300:]  # the end of a path says more than its start
+        return InputError(f"{': '.join(filter(None, (file, self.field)))}: {problem}; {hint}")
 
 
 @dataclass(frozen=True)
@@ -69,16 +60,11 @@ class SourceFile:
         return self.location.error(f"{quote(self.name)} {problem}" if self.name else problem, hint)
 
     def read_bytes(self) -> bytes:
-        """All of its bytes.
-
-        Raises:
-            InputError: the file is missing, empty, unreadable, or no regular file (a pipe would block).
-        """
+        """All of its bytes; InputError for a file that is missing, empty, unreadable, or not regular."""
         try:
-            mode = os.stat(self.path).st_mode
-            if stat.S_ISDIR(mode):
+            if self.path.is_dir():
                 raise self.error("is a directory", "a file is expected there")
-            if not stat.S_ISREG(mode):
+            if self.path.exists() and not self.path.is_file():  # reading a pipe would block
                 raise self.error("is not a regular file", "a plain file is expected there")
             data = self.path.read_bytes()
         except FileNotFoundError:
