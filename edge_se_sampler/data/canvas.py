@@ -45,15 +45,12 @@ class Canvas:
     @property
     def corners(self) -> dict[str, Pair]:
         """The picture's upper left corner on the canvas, by copy."""
-        x, y = self.pad
-        return dict(zip(COPIES, ((x, y), (x + self.shift[0], y + self.shift[1])), strict=True))
+        return {"centered": self.pad, "shifted": (self.pad[0] + self.shift[0], self.pad[1] + self.shift[1])}
 
     def visible(self, corner: Pair) -> tuple[slice, slice]:
         """The rows and columns of the picture that land on the canvas."""
         (width, height), (x, y) = self.size, corner
-        rows = slice(max(0, -y), min(self.picture[1], height - y))
-        columns = slice(max(0, -x), min(self.picture[0], width - x))
-        return rows, columns
+        return slice(max(0, -y), min(self.picture[1], height - y)), slice(max(0, -x), min(self.picture[0], width - x))
 
     def paste(self, image: np.ndarray, corner: Pair, color: np.ndarray) -> np.ndarray:
         """The (H', W', ...) canvas that shows an (H, W, ...) image at `corner`, and `color` (...) around it."""
@@ -67,23 +64,15 @@ class Canvas:
         """How many pixels of (H, W) bool `foreground` the shifted copy would cut off."""
         return int(np.count_nonzero(foreground) - np.count_nonzero(foreground[self.visible(self.corners["shifted"])]))
 
-    def min_pad(self, foreground: np.ndarray) -> tuple[float, float]:
-        """The smallest padding, as fractions of W and H, with which the shifted copy keeps (H, W) bool `foreground`."""
-        columns, rows = np.flatnonzero(foreground.any(axis=0)), np.flatnonzero(foreground.any(axis=1))
-        (width, height), (right, down) = self.picture, self.shift
-        return _overhang(columns + right, width) / width, _overhang(rows + down, height) / height
-
-
-def _overhang(positions: np.ndarray, length: int) -> int:
-    """How far the furthest of (n,) columns (or rows) lies outside 0 to length - 1."""
-    return max(0, -int(positions.min()), int(positions.max()) + 1 - length) if len(positions) else 0
+    def min_pad(self, foreground: np.ndarray) -> np.ndarray:
+        """(2,) fractions of W and H: the least padding with which the shifted copy keeps (H, W) bool `foreground`."""
+        positions = np.argwhere(foreground)[:, ::-1] + self.shift
+        before, after = -positions.min(axis=0, initial=0), positions.max(axis=0, initial=0) + 1 - self.picture
+        return np.maximum(before, after) / self.picture
 
 
 def plain_background(image: np.ndarray) -> np.ndarray | None:
-    """(C,) uint8, what lies around the object of an (H, W, C) image.
-
-    Transparent black for RGBA; for RGB the one color of the image's border, None if that has several.
-    """
+    """(C,) uint8 around an (H, W, C) image's object: RGBA transparent black, RGB its border's color, None if several."""
     if image.shape[2] == 4:
         return np.zeros(4, np.uint8)
     border = np.concatenate((image[0], image[-1], image[:, 0], image[:, -1]))

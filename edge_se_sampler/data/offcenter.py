@@ -10,7 +10,6 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,15 +28,7 @@ from edge_se_sampler.errors import InputError
 Fractions = tuple[float, float]  # of an image's width and height
 
 
-@dataclass(frozen=True)
-class _SplitPlan:
-    """A split that can be copied as promised."""
-
-    split: Split
-    document: dict[str, Any]
-    """Its json."""
-    files: list[dict[str, str]]
-    """Of each frame: file_path, mask_path -> the file inside a copy."""
+Files = list[dict[str, str]]  # of each frame: file_path, mask_path -> the file inside a copy
 
 
 def offcenter(
@@ -45,7 +36,7 @@ def offcenter(
     out: Path,
     shift: Fractions = (0.2, 0.15),
     pad: Fractions | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
     """Write every split of `data` twice, padded and centered to out/centered, padded and shifted to out/shifted.
 
@@ -71,17 +62,20 @@ def offcenter(
     data, target = Path(data), Path(os.path.abspath(out))
     with staged_folders(target.parent, [target]) as workspace, ThreadPoolExecutor() as pool:
         folder = workspace / target.name
-        plans = _plan_splits(data, shift, pad)
-        done, total = 0, sum(len(plan.files) for plan in plans)
-        for plan in plans:
-            views = read_blender(data, plan.split)
+        plan = _plan_copies(data, shift, pad)
+        done, total = 0, sum(map(len, plan.values()))
+        for split, files in plan.items():
+            views = read_blender(data, split)
             canvases = [Canvas.of(image, shift, pad) for image in views.images]
-            _write_documents(folder, plan, views, canvases)
+            document = read_json(transforms_path(data, split)).object()
+            for copy in COPIES:
+                (folder / copy).mkdir(parents=True, exist_ok=True)
+                text = json.dumps(_document(document, files, views, canvases, copy), indent=4)
+                transforms_path(folder / copy, split).write_text(text, encoding="utf-8")
             masks = views.masks or (None,) * len(canvases)
-            for _ in pool.map(partial(_write_view, folder), plan.files, canvases, views.images, masks):
+            for _ in pool.map(partial(_write_view, folder), files, canvases, views.images, masks):
                 done += 1
-                if progress:
-                    progress(done, total)
+                progress(done, total)
     return [target / copy for copy in COPIES]
 
 
@@ -92,20 +86,23 @@ def _check_fractions(shift: Fractions, pad: Fractions | None) -> None:
         raise InputError(f"pad is {pad}: give two numbers from 0 to 1, fractions of the image's size")
 
 
-def _plan_splits(data: Path, shift: Fractions, pad: Fractions | None) -> list[_SplitPlan]:
-    """All splits, read once to the end; InputError for what cannot be copied as promised."""
-    plans: list[_SplitPlan] = []
+def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Split, Files]:
+    """What to write for each split, all read to the end; InputError for what cannot be copied as promised."""
+    plan: dict[Split, Files] = {}
     written: dict[str, tuple[str, str]] = {}
     cut_off: list[tuple[JsonValue, int]] = []
     needed = np.zeros(2)  # padding, over all views
     found: tuple[Split, ...] = tuple(split for split in SPLITS if has_split(data, split))
     for split in found or SPLITS[:1]:  # where there is none, the loader says so
         views = read_blender(data, split)
-        document = read_json(transforms_path(data, split))
-        frames = document.required("frames", "").list()
-        plans.append(_SplitPlan(split, document.value, [_output_files(data, frame, written) for frame in frames]))
+        frames = read_json(transforms_path(data, split)).required("frames", "").list()
+        plan[split] = [_output_files(data, frame, written) for frame in frames]
         for image, frame in zip(views.images, frames, strict=True):
-            canvas, foreground = Canvas.of(image, shift, pad), _object_mask(image, frame)
+            background = plain_background(image)
+            if background is None:
+                problem = "has no plain background: the pixels of its border differ"
+                raise _image_error(frame, problem, "cut the object out (RGBA), or make the border one color")
+            canvas, foreground = Canvas.of(image, shift, pad), object_mask(image, background)
             needed = np.maximum(needed, canvas.min_pad(foreground))
             if count := canvas.count_cut_off(foreground):
                 cut_off.append((frame, count))
@@ -114,21 +111,12 @@ def _plan_splits(data: Path, shift: Fractions, pad: Fractions | None) -> list[_S
         more = f" ({len(cut_off)} views would lose some)" if cut_off[1:] else ""
         problem = f"would lose {count} pixels of its object past the edge of the canvas{more}"
         raise _image_error(frame, problem, f"give at least --pad {needed[0]:g} {needed[1]:g}, or no --pad")
-    return plans
+    return plan
 
 
 def _image_error(frame: JsonValue, problem: str, hint: str) -> InputError:
     listed = quote(listed_file(frame.value["file_path"]))
     return frame.location.member("file_path").error(f"{listed} {problem}", hint)
-
-
-def _object_mask(image: np.ndarray, frame: JsonValue) -> np.ndarray:
-    """(H, W) bool: the object's pixels; InputError where the background is not known."""
-    background = plain_background(image)
-    if background is None:
-        problem = "has no plain background: the pixels of its border differ"
-        raise _image_error(frame, problem, "cut the object out (RGBA), or make the border one color")
-    return object_mask(image, background)
 
 
 def _output_files(data: Path, frame: JsonValue, written: dict[str, tuple[str, str]]) -> dict[str, str]:
@@ -149,14 +137,9 @@ def _output_files(data: Path, frame: JsonValue, written: dict[str, tuple[str, st
     return files
 
 
-def _write_documents(folder: Path, plan: _SplitPlan, views: Views, canvases: Sequence[Canvas]) -> None:
-    for copy in COPIES:
-        (folder / copy).mkdir(parents=True, exist_ok=True)
-        text = json.dumps(_document(plan, views, canvases, copy), indent=4)
-        transforms_path(folder / copy, plan.split).write_text(text, encoding="utf-8")
-
-
-def _document(plan: _SplitPlan, views: Views, canvases: Sequence[Canvas], copy: str) -> dict[str, Any]:
+def _document(
+    source: dict[str, Any], files: Files, views: Views, canvases: Sequence[Canvas], copy: str
+) -> dict[str, Any]:
     """The json of a copy: the source's, but for the cameras' intrinsics, and .jpg that became .png."""
     intrinsics = [
         {
@@ -170,7 +153,7 @@ def _document(plan: _SplitPlan, views: Views, canvases: Sequence[Canvas], copy: 
         for i, canvas in enumerate(canvases)
     ]
     shared = {key: value for key, value in intrinsics[0].items() if all(other[key] == value for other in intrinsics)}
-    top = {key: value for key, value in plan.document.items() if key not in intrinsics[0]} | shared
+    top = {key: value for key, value in source.items() if key not in intrinsics[0]} | shared
     if "camera_angle_x" in top:  # not for us, who take fl_x, but for loaders that know nothing else
         if "w" in shared:
             widened = canvases[0].size[0] / canvases[0].picture[0]
@@ -181,8 +164,8 @@ def _document(plan: _SplitPlan, views: Views, canvases: Sequence[Canvas], copy: 
     top["frames"] = [
         frame
         | {key: value for key, value in own.items() if key in frame or key not in shared}
-        | {key: file for key, file in files.items() if not listed_file(frame[key]).lower().endswith(".png")}
-        for frame, own, files in zip(plan.document["frames"], intrinsics, plan.files, strict=True)
+        | {key: file for key, file in written.items() if not listed_file(frame[key]).lower().endswith(".png")}
+        for frame, own, written in zip(source["frames"], intrinsics, files, strict=True)
     ]
     return top
 
@@ -192,7 +175,7 @@ def _write_view(
 ) -> None:
     """One view's picture into both copies and, where its frame has one, its mask (H, W) bool as gray."""
     background = plain_background(image)
-    assert background is not None  # as _plan_splits saw
+    assert background is not None  # _plan_copies has checked that
     layers: dict[str, tuple[np.ndarray, np.ndarray]] = {files["file_path"]: (image, background)}
     if mask is not None and "mask_path" in files:
         layers[files["mask_path"]] = (mask * np.uint8(255), np.zeros((), np.uint8))
