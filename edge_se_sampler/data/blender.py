@@ -14,8 +14,7 @@ import numpy as np
 
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.image_file import read_image
-from edge_se_sampler.data.json_value import JsonValue, read_json
-from edge_se_sampler.data.source_location import SourceFile, SourceLocation, quote
+from edge_se_sampler.data.scene_file import JsonValue, SourceFile, SourceLocation, quote, read_json
 from edge_se_sampler.data.views import Views
 
 Split = Literal["train", "val", "test"]
@@ -26,7 +25,7 @@ _RIGID_TOLERANCE = 1e-3  # of the rotation's entries: real files are rounded
 _LAST_ROW_TOLERANCE = 1e-6  # 0 and 1 survive rounding, so this only forgives arithmetic
 _MIN_ANGLE = 1e-6  # radians; below, focal lengths overflow before they mean anything
 
-# Of the image and its camera, all in pixels: for one frame, or at the top of the file for all frames
+# of the image and its camera, all in pixels: for one frame, or at the top of the file for all frames
 _INTRINSICS = {
     "w": JsonValue.count,
     "h": JsonValue.count,
@@ -46,10 +45,8 @@ class _Frame:
     file_path: str
     image: SourceFile
     mask: SourceFile | None
-    pose: np.ndarray
-    """(3, 4) float64, camera to world."""
-    intrinsics: dict[str, JsonValue]
-    """By their names in _INTRINSICS; the frame's own replace the file's."""
+    pose: np.ndarray  # (3, 4) float64, camera to world
+    intrinsics: dict[str, JsonValue]  # by their names in _INTRINSICS; the frame's own replace the file's
 
     def get(self, key: str, default: float) -> float:
         return self.intrinsics[key].number() if key in self.intrinsics else default
@@ -172,11 +169,9 @@ def _read_half_tan(top: JsonValue, frames: Sequence[_Frame]) -> float:
     """tan(camera_angle_x / 2); NaN if there is no such angle and every frame has its fl_x instead."""
     angle = top.optional("camera_angle_x")
     if angle is None:
-        for frame in frames:
-            if "fl_x" not in frame.intrinsics:
-                field = frame.location.field
-                hint = f"add the horizontal field of view in radians, or give {field} its fl_x in pixels"
-                raise top.location.member("camera_angle_x").error("is missing", hint)
+        for field in (frame.location.field for frame in frames if "fl_x" not in frame.intrinsics):
+            hint = f"add the horizontal field of view in radians, or give {field} its fl_x in pixels"
+            raise top.location.member("camera_angle_x").error("is missing", hint)
         return math.nan
     if not _MIN_ANGLE <= angle.number() < math.pi:
         hint = "write the horizontal field of view in radians (degrees times pi/180)"

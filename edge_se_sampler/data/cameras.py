@@ -18,14 +18,10 @@ from torch import Tensor
 class RayBundle:
     """n rays."""
 
-    origins: Tensor
-    """(n, 3) world units."""
-    directions: Tensor
-    """(n, 3) unit vectors."""
-    camera_indices: Tensor
-    """(n, 1) int64."""
-    metadata: dict[str, Tensor]
-    """"directions_norm" (n, 1): length of the direction whose depth along the optical axis is 1."""
+    origins: Tensor  # (n, 3) world units
+    directions: Tensor  # (n, 3) unit vectors
+    camera_indices: Tensor  # (n, 1) int64
+    metadata: dict[str, Tensor]  # "directions_norm" (n, 1): length of the direction whose depth along the axis is 1
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -39,20 +35,13 @@ class RayBundle:
 class Cameras:
     """n pinhole cameras, all tensors but the sizes of one floating-point type."""
 
-    camera_to_worlds: Tensor
-    """(n, 3, 4): rotation | position in world units."""
-    fx: Tensor
-    """(n, 1) focal length, pixels."""
-    fy: Tensor
-    """(n, 1) pixels."""
-    cx: Tensor
-    """(n, 1) principal point, pixels."""
-    cy: Tensor
-    """(n, 1) pixels."""
-    width: Tensor
-    """(n, 1) int64 pixels."""
-    height: Tensor
-    """(n, 1) int64 pixels."""
+    camera_to_worlds: Tensor  # (n, 3, 4): rotation | position in world units
+    fx: Tensor  # (n, 1) focal length, pixels
+    fy: Tensor  # (n, 1) pixels
+    cx: Tensor  # (n, 1) principal point, pixels
+    cy: Tensor  # (n, 1) pixels
+    width: Tensor  # (n, 1) int64 pixels
+    height: Tensor  # (n, 1) int64 pixels
 
     @classmethod
     def of(
@@ -87,12 +76,7 @@ class Cameras:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         """The same cameras on a device, in a floating-point type."""
-        return Cameras(
-            **{
-                key: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-                for key, value in vars(self).items()
-            }
-        )
+        return Cameras(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in vars(self).items()})
 
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
         """One ray for each coordinate.
@@ -121,10 +105,7 @@ class Cameras:
         return self.pixel_rays(torch.cartesian_prod(torch.tensor([camera]), torch.arange(height), torch.arange(width)))
 
     def project(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Where one camera sees points: the inverse of `generate_rays`.
-
-        Args:
-            points: (m, 3) world units.
+        """Where one camera sees points (m, 3) in world units: the inverse of `generate_rays`.
 
         Returns:
             coords (m, 2): y, x in pixels, without meaning for points that are not in front of the camera.
@@ -138,13 +119,10 @@ class Cameras:
         return torch.stack((y, x), dim=1), depth
 
     def interpolate(self, first: int, second: int, fraction: float) -> Cameras:
-        """One camera on the way from one to another, with the first one's intrinsics and size.
+        """One camera at a fraction, in [0, 1], of the way between two, with the first one's intrinsics and size.
 
         It rotates at an even rate, and the world's origin moves evenly in its view: between cameras that look at one
         point it looks there too.
-
-        Args:
-            fraction: of the way, in [0, 1].
         """
         a, b = self.camera_to_worlds[first].double(), self.camera_to_worlds[second].double()
         rotation = a[:, :3] @ rotation_power(a[:, :3].T @ b[:, :3], fraction)
@@ -154,10 +132,7 @@ class Cameras:
 
 
 def rotation_power(rotation: Tensor, exponent: float) -> Tensor:
-    """The rotation by `exponent` times a rotation's angle about its axis, (3, 3) -> (3, 3) float64.
-
-    An angle of pi may be taken in either sense.
-    """
+    """The rotation (3, 3) float64 by `exponent` times a rotation's angle (pi: in either sense) about its axis."""
     rotation = rotation.double()
     axis = torch.linalg.eigh((rotation + rotation.T) / 2).eigenvectors[:, 2]  # of the eigenvalue 1, the largest
     x, y, z = axis.tolist()

@@ -72,7 +72,7 @@ class Canvas:
 
 
 def plain_background(image: np.ndarray) -> np.ndarray | None:
-    """(C,) uint8 around an (H, W, C) image's object: RGBA transparent black, RGB its border's color, None if several."""
+    """(C,) uint8, around the object: transparent black (RGBA), or the color of its border (RGB; None if of several)."""
     if image.shape[2] == 4:
         return np.zeros(4, np.uint8)
     border = np.concatenate((image[0], image[-1], image[:, 0], image[:, -1]))

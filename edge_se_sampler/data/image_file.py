@@ -8,7 +8,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.source_location import SourceFile, quote
+from edge_se_sampler.data.scene_file import SourceFile, quote
 from edge_se_sampler.errors import InputError
 
 _PNG = b"\x89PNG\r\n\x1a\n"

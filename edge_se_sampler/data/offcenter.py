@@ -19,14 +19,12 @@ import numpy as np
 
 from edge_se_sampler.data.blender import SPLITS, Split, has_split, listed_file, read_blender, transforms_path
 from edge_se_sampler.data.canvas import COPIES, Canvas, object_mask, plain_background
-from edge_se_sampler.data.json_value import JsonValue, read_json
 from edge_se_sampler.data.new_folder import staged_folders
-from edge_se_sampler.data.source_location import quote
+from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
 Fractions = tuple[float, float]  # of an image's width and height
-
 
 Files = list[dict[str, str]]  # of each frame: file_path, mask_path -> the file inside a copy
 
@@ -87,7 +85,7 @@ def _check_fractions(shift: Fractions, pad: Fractions | None) -> None:
 
 
 def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Split, Files]:
-    """What to write for each split, all read to the end; InputError for what cannot be copied as promised."""
+    """The files of each split, all read to the end; InputError for what cannot be copied as promised."""
     plan: dict[Split, Files] = {}
     written: dict[str, tuple[str, str]] = {}
     cut_off: list[tuple[JsonValue, int]] = []

@@ -14,14 +14,10 @@ from edge_se_sampler.data.cameras import Cameras
 class Views:
     """n images and the cameras that took them."""
 
-    names: tuple[str, ...]
-    """Of each view, its file as the scene lists it."""
-    images: tuple[np.ndarray, ...]
-    """View i: (H_i, W_i, 3|4) uint8, sRGB, straight alpha."""
-    masks: tuple[np.ndarray, ...] | None
-    """View i: (H_i, W_i) bool, True where the view may be trained on; None: everywhere in all views."""
-    cameras: Cameras
-    """n, float64: poses as the scene gives them, not moved or scaled."""
+    names: tuple[str, ...]  # of each view, its file as the scene lists it
+    images: tuple[np.ndarray, ...]  # view i: (H_i, W_i, 3|4) uint8, sRGB, straight alpha
+    masks: tuple[np.ndarray, ...] | None  # view i: (H_i, W_i) bool, True where it may be trained on; None: everywhere
+    cameras: Cameras  # n, float64: poses as the scene gives them, not moved or scaled
 
     def subset(self, indices: Sequence[int]) -> Views:
         """The views of these indices, in this order."""
