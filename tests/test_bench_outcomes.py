@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench.outcomes import classify, failed, foreground_share, measure_background, measure_outcome
+from edge_se_sampler.bench.outcomes import classify, failed, measure_outcome
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import composite_on, compute_metrics
 from edge_se_sampler.engine.rendering import Picture, to_pictures
@@ -30,8 +30,8 @@ def measure(pictures: list[Picture], whiten: float) -> dict[str, Any]:
 def test_the_error_on_the_object_is_a_share_of_the_backgrounds(
     whiten: float, share: float, pictures: list[Picture]
 ) -> None:
-    background = measure_background(pictures, 1.0)
-    assert foreground_share(measure(pictures, whiten), background) == pytest.approx(share, rel=0.01)
+    outcome = measure_outcome(measure(pictures, whiten), pictures, 1.0)
+    assert outcome["foreground_share"] == pytest.approx(share, rel=0.01)
 
 
 @pytest.mark.parametrize(

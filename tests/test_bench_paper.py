@@ -264,7 +264,7 @@ def test_padded_and_shifted_counterparts_of_real_scenes(real_data: Path, tmp_pat
         (("--preset", "paper", "--data", "/nowhere"), "--data /nowhere: chair/transforms_train.json is missing"),
         (("--scenes", "lego"), "--scenes: 'lego'"),
         (("--strategies", "edge"), "--strategies: 'edge'"),
-        (("--workers", "0"), "at least one"),
+        (("--workers", "0"), "--workers is 0: must be at least 1"),
         (("--scheduler", "nowhere"), "--scheduler"),
     ],
 )

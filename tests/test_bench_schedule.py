@@ -142,8 +142,8 @@ def test_the_command_trains_in_stages_what_is_pending(
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--workers", "0"), "at least one"),
-        (("--seeds",), "at least one"),
+        (("--workers", "0"), "--workers is 0: must be at least 1"),
+        (("--seeds",), "--seeds is empty"),
         (("--length-seeds", "0", "100"), "selected on [100]"),
     ],
 )

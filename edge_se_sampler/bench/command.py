@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import check_value
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from edge_se_sampler.bench.runner import Experiment
 
 
@@ -51,28 +48,21 @@ class ExperimentCommand(ABC):
             InputError: as `experiment`, `run_experiment` and `write_report`.
         """
         from edge_se_sampler.bench.report import write_report
-        from edge_se_sampler.bench.runner import list_trials, run_experiment
+        from edge_se_sampler.bench.runner import executor_factory, list_trials, run_experiment
         from edge_se_sampler.bench.statistics import require_scipy_stats
         from edge_se_sampler.engine.figures import require_pyplot
 
-        if not self.seeds:
-            raise InputError("--seeds: give at least one")
+        check_value("seeds", "empty", bool(self.seeds), "at least one number")
+        check_value("workers", self.workers, self.workers is None or self.workers > 0, "at least 1")
         experiment = self.experiment()
         if self.dry_run:
             list_trials(experiment, self.output_dir)
             return
         require_pyplot()
         require_scipy_stats()
-        run_experiment(experiment, self.output_dir, self.executor())
+        new_executor = executor_factory(self.workers or self.default_workers(), self.scheduler)
+        run_experiment(experiment, self.output_dir, new_executor)
         write_report(self.output_dir, workplace=self.workplace)
-
-    def executor(self) -> Callable[[], Executor]:
-        """What makes the executor that --workers or --scheduler name."""
-        from edge_se_sampler.bench.runner import executor_factory
-
-        if self.workers is not None and self.workers < 1:
-            raise InputError(f"--workers is {self.workers}: give at least one")
-        return executor_factory(self.workers or self.default_workers(), self.scheduler)
 
     def default_workers(self) -> int:
         """How many trainings at once if --workers is left out."""

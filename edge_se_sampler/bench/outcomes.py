@@ -38,35 +38,28 @@ def failed(run: dict[str, Any]) -> bool:
     return run["outcome"] != "converged"
 
 
-def measure_background(pictures: list[Picture], color: float) -> list[dict[str, float | None]]:
-    """`compute_metrics` of answering every view with a plain grey background (0 black, 1 white)."""
-    return [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
-
-
-def foreground_share(results: dict[str, Any], background: list[dict[str, float | None]]) -> float:
-    """Error on the object as a share of the error that the background alone has there, a mean over the views.
+def measure_outcome(results: dict[str, Any], pictures: list[Picture], color: float) -> dict[str, Any]:
+    """Compare a training with answering every view with a plain grey background (0 black, 1 white).
 
     Args:
-        results: of `evaluate`.
-        background: of `measure_background` on the same views.
+        results: `evaluate` of it on the pictures.
+
+    Returns:
+        background_psnr; foreground_share, the error on the object as a share of the error that the background alone has
+        there, a mean over the views; outcome.
 
     Raises:
         InputError: no view tells the object from the background.
     """
-    pairs = [
-        (rendered["foreground_psnr"], empty["foreground_psnr"])
+    background = [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
+    gains = [
+        rendered["foreground_psnr"] - empty["foreground_psnr"]
         for rendered, empty in zip(results["images"], background, strict=True)
+        if rendered["foreground_psnr"] is not None and empty["foreground_psnr"] is not None
     ]
-    shares = [10 ** ((empty - rendered) / 10) for rendered, empty in pairs if None not in (rendered, empty)]
-    if not shares:
+    if not gains:
         raise InputError("the held-out views show no object by alpha, which the rule of failure needs")
-    return float(np.mean(shares))
-
-
-def measure_outcome(results: dict[str, Any], pictures: list[Picture], color: float) -> dict[str, Any]:
-    """background_psnr, foreground_share and outcome of a training by its `evaluate` on pictures."""
-    background = measure_background(pictures, color)
     background_psnr = sum(view["psnr"] or 0.0 for view in background) / len(background)
-    share = foreground_share(results, background)
+    share = float(np.mean([10 ** (-gain / 10) for gain in gains]))
     outcome = classify(results["psnr"], background_psnr, share)
     return {"background_psnr": background_psnr, "foreground_share": share, "outcome": outcome}

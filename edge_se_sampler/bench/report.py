@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from string import Formatter
@@ -13,15 +14,8 @@ from edge_se_sampler.bench.tables import fill_markers
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 
-REPORTS = {
-    "chart": "chart.report",
-    "paper": "paper.report",
-    "stability": "stability.report",
-    "schedule": "schedule.report",
-    "nerfstudio": "nerfstudio.report",
-    "micro": "micro.report",
-    "demo": "demo",
-}
+REPORTS = {name: f"{name}.report" for name in ("chart", "paper", "stability", "schedule", "nerfstudio", "micro")}
+REPORTS["demo"] = "demo"
 """Experiment -> the module of `edge_se_sampler.bench` that reports it."""
 
 
@@ -44,11 +38,13 @@ def report_of(folder: Path) -> Report:
         InputError: no result lies there.
     """
     for path in sorted(folder.glob("**/*.json")):
-        name = _experiment_of(path)
-        if name in REPORTS:
-            module: Any = import_module(f"edge_se_sampler.bench.{REPORTS[name]}")
-            return module
-    raise InputError(f"{folder}: no result of edge-se bench lies there")
+        with suppress(OSError, ValueError, TypeError, KeyError):
+            name = REPORTS[json.loads(path.read_text(encoding="utf-8"))["experiment"]]
+            break
+    else:
+        raise InputError(f"{folder}: no result of edge-se bench lies there")
+    module: Any = import_module(f"edge_se_sampler.bench.{name}")
+    return module
 
 
 def write_report(folder: Path, readme: Path | None = None, workplace: Path | None = None) -> None:
@@ -89,12 +85,3 @@ def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:
 def _is_empty(section: str, parts: dict[str, object]) -> bool:
     names = [name for _, name, _, _ in Formatter().parse(section) if name]
     return bool(names) and all(parts.get(name, "") == "" for name in names)
-
-
-def _experiment_of(path: Path) -> str | None:
-    """The experiment that a json file says it is of."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return content.get("experiment") if isinstance(content, dict) else None

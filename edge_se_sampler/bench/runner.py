@@ -31,6 +31,7 @@ MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
 Run = dict[str, Any]
+ExecutorFactory = Callable[[], Executor]
 
 
 @dataclass(frozen=True)
@@ -52,26 +53,26 @@ class Experiment:
 
 def list_trials(experiment: Experiment, output_dir: Path) -> None:
     """Print the names of the trials that are known yet, and how many of them are pending."""
-    result = load_or_create(output_dir / "result.json", experiment)
+    result = load_or_create(output_dir / "result.json", experiment.name, experiment.settings)
     trials = experiment.trials(result["runs"])
     for trial in trials:
         print(trial.name)
     print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
 
 
-def run_experiment(experiment: Experiment, output_dir: Path, new_executor: Callable[[], Executor]) -> dict[str, Any]:
+def run_experiment(experiment: Experiment, output_dir: Path, new_executor: ExecutorFactory) -> dict[str, Any]:
     """Train every pending trial; result.json is written after each.
 
     Raises:
         InputError: the folder cannot be written, or holds a result of other settings.
     """
     path = output_dir / "result.json"
-    result = load_or_create(path, experiment)
+    result = load_or_create(path, experiment.name, experiment.settings)
     trials = experiment.trials(result["runs"])
     make_folder(output_dir, "--output-dir")
     result["errors"] = []
     while pending(trials, result):
-        run_trials(trials, result, path, new_executor, experiment)
+        _run_trials(experiment, trials, result, path, new_executor)
         trials = experiment.trials(result["runs"])
     for error in result["errors"]:
         print(", ".join(str(value) for value in error.values()))
@@ -79,17 +80,17 @@ def run_experiment(experiment: Experiment, output_dir: Path, new_executor: Calla
     return result
 
 
-def load_or_create(path: Path, experiment: Experiment) -> dict[str, Any]:
-    """The result of an earlier call with the same settings, or an empty one.
+def load_or_create(path: Path, experiment: str, settings: Any) -> dict[str, Any]:
+    """The result of an earlier call with the same settings (a dataclass), or an empty one.
 
     Raises:
         InputError: the file is no result, or one of another version, experiment or settings.
     """
-    settings = json.loads(json.dumps(asdict(experiment.settings)))
+    settings = json.loads(json.dumps(asdict(settings)))
     if not path.exists():
-        return new_result(experiment.name, settings) | {"errors": [], "runs": []}
+        return new_result(experiment, settings) | {"errors": [], "runs": []}
     result = read_result(path)
-    if result["experiment"] != experiment.name or result["settings"] != settings:
+    if (result["experiment"], result["settings"]) != (experiment, settings):
         raise InputError(f"{path}: of another experiment or other settings; name another --output-dir, or move it away")
     result["command"] = "\n".join(dict.fromkeys([*result["command"].splitlines(), _command()]))
     return result
@@ -137,45 +138,36 @@ def write_result(path: Path, result: dict[str, Any]) -> None:
 
 def pending(trials: Sequence[Any], result: dict[str, Any]) -> list[Any]:
     """The trials that have neither a run nor an error in the result."""
-    done = [*result["runs"], *result["errors"]]
     keys = list(asdict(trials[0])) if trials else []
-    finished = {tuple(run.get(key) for key in keys) for run in done}
+    finished = {tuple(run.get(key) for key in keys) for run in [*result["runs"], *result["errors"]]}
     return [trial for trial in dict.fromkeys(trials) if tuple(asdict(trial).values()) not in finished]
 
 
-def run_trials(
-    trials: Sequence[Any],
-    result: dict[str, Any],
-    path: Path,
-    new_executor: Callable[[], Executor],
-    experiment: Experiment,
+def _run_trials(
+    experiment: Experiment, trials: Sequence[Any], result: dict[str, Any], path: Path, new_executor: ExecutorFactory
 ) -> None:
     """Train the pending ones of some trials. One that fails goes to `errors`, is tried again by the next call of the
     command, and stops no other."""
-    progress = Progress(len(trials), experiment.name, start=len(trials) - len(pending(trials, result)))
-    for _ in range(MAX_BROKEN_POOLS):
-        todo = pending(trials, result)
-        if not todo:
-            break
-        with new_executor() as executor:
-            trial_of = {executor.submit(experiment.train, t, *experiment.arguments(t)): t for t in todo}
-            try:
-                for future in as_completed(trial_of):
-                    _store(result, trial_of[future], future)
-                    write_result(path, result)
-                    progress.update(len(trials) - len(pending(trials, result)))
-            except BaseException as problem:
-                for future in trial_of:
-                    future.cancel()
-                if isinstance(problem, BrokenExecutor):
-                    continue
-                for child in multiprocessing.active_children():  # their unfinished trials are lost in any case
-                    child.terminate()
-                raise
-        break
+    with Progress(len(trials), experiment.name, start=len(trials) - len(pending(trials, result))) as progress:
+        for _ in range(MAX_BROKEN_POOLS):
+            with new_executor() as executor:
+                todo = pending(trials, result)
+                trial_of = {executor.submit(experiment.train, t, *experiment.arguments(t)): t for t in todo}
+                try:
+                    for future in as_completed(trial_of):
+                        _store(result, trial_of[future], future)
+                        write_result(path, result)
+                        progress.update(len(trials) - len(pending(trials, result)))
+                    break
+                except BaseException as problem:
+                    for future in trial_of:
+                        future.cancel()
+                    if not isinstance(problem, BrokenExecutor):
+                        for child in multiprocessing.active_children():  # their unfinished trials are lost in any case
+                            child.terminate()
+                        raise
     for trial in pending(trials, result):
         result["errors"].append({**asdict(trial), "error": "its process, or one beside it, was killed repeatedly"})
-    progress.close()
     write_result(path, result)
 
 
@@ -191,7 +183,7 @@ def _store(result: dict[str, Any], trial: Any, future: Future[Run]) -> None:
     result["runs"].sort(key=lambda run: [run[key] for key in asdict(trial)])
 
 
-def executor_factory(workers: int, scheduler: str | None) -> Callable[[], Executor]:
+def executor_factory(workers: int, scheduler: str | None) -> ExecutorFactory:
     """What makes the executor: processes of this machine, or those of a dask cluster by its scheduler's address.
 
     Raises:

@@ -86,8 +86,3 @@ def format_difference(difference: PairedDifference) -> str:
         return "–"
     known = difference.low is not None
     return f"{difference.mean:+.2f}" + (f" [{difference.low:+.2f}, {difference.high:+.2f}]" if known else "")
-
-
-def rank_correlation(first: Any, second: Any) -> float:
-    """Spearman's correlation of two arrays of scores."""
-    return float(require_scipy_stats().spearmanr(first, second).statistic)

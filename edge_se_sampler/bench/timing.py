@@ -16,12 +16,7 @@ def time_interleaved(
     warmup: int = 1,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
-    """Seconds of every case in every round that counts.
-
-    Args:
-        cases: name -> function of the round's number.
-        warmup: rounds before those that count.
-    """
+    """Seconds of every case (name -> function of the round's number) in every round after those of warmup."""
     seconds: dict[str, list[float]] = {name: [] for name in cases}
     progress = Progress(warmup + rounds, "timing")
     for number in range(warmup + rounds):

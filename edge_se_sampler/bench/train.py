@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import time
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -50,6 +51,7 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
         view_path.parent.mkdir(parents=True, exist_ok=True)
         write_image(view_path, views[0])
     metrics, every = trainer.run.metrics(), trainer.config.steps_per_log
+    drawn = [line for line in metrics if "strategy" in line]
     return {
         **{key: results[key] for key in MEASURES},
         **measure_outcome(results, pictures, model.config.background_level),
@@ -60,14 +62,5 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
         "cpu_seconds": round(cpu_seconds, 3),
         "loss_every": every,
         "loss": [float(f"{line['loss']:.4g}") for line in metrics if "loss" in line and line["step"] % every == 0],
-        "phases": _list_phases(metrics),
+        "phases": [[next(lines)["step"], strategy] for strategy, lines in groupby(drawn, itemgetter("strategy"))],
     }
-
-
-def _list_phases(metrics: list[dict[str, Any]]) -> list[list[Any]]:
-    """[step, strategy] wherever the logged strategy changed."""
-    phases: list[list[Any]] = []
-    for line in metrics:
-        if "strategy" in line and (not phases or phases[-1][1] != line["strategy"]):
-            phases.append([line["step"], line["strategy"]])
-    return phases

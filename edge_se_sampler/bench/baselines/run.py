@@ -31,7 +31,7 @@ import torch
 
 from edge_se_sampler.bench.baselines.results import BaselineSettings
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
-from edge_se_sampler.bench.runner import Experiment, Run, load_or_create, pending, run_in_subprocess, write_result
+from edge_se_sampler.bench.runner import Run, load_or_create, pending, run_in_subprocess, write_result
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
@@ -109,7 +109,7 @@ def run_baseline(
         InputError: the program is not there, refuses its flags or ends too soon, or the json is of other settings.
     """
     trials = [Trial(scene, seed) for seed, scene in product(seeds, scenes)]
-    result = load_or_create(path, Experiment("baselines", settings, lambda _: trials, train, lambda _: ()))
+    result = load_or_create(path, "baselines", settings)
     for trial in pending(trials, result):
         try:
             run = run_in_subprocess(train, Task(settings, checkout, scenes[trial.scene], trial.seed))

@@ -15,7 +15,7 @@ import torch
 
 from edge_se_sampler.bench.micro.samplers import late_phase, training_peak
 from edge_se_sampler.bench.overrides import override
-from edge_se_sampler.bench.statistics import rank_correlation, require_scipy_stats
+from edge_se_sampler.bench.statistics import require_scipy_stats
 from edge_se_sampler.bench.timing import medians, time_interleaved
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.session import prepare
@@ -97,4 +97,5 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
                 of_level.append(model.squared_error(outputs, image[rows], level))
     fine, coarse = (torch.cat(of_level).numpy() for of_level in errors.values())
     cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)
-    return {"coarse": rank_correlation(fine, coarse), "cached": rank_correlation(fine, cached)}
+    spearman = require_scipy_stats().spearmanr
+    return {"coarse": float(spearman(fine, coarse).statistic), "cached": float(spearman(fine, cached).statistic)}
