@@ -8,7 +8,7 @@ from edge_se_sampler.bench.outcomes import FAILURE_RULE
 from edge_se_sampler.bench.paper.figures import draw_figures
 from edge_se_sampler.bench.paper.tables import format_psnr, psnr_table, select_runs
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, TABLES
-from edge_se_sampler.bench.paper.verdicts import MIN_DIFFERENCE, ClaimVerdict, ComparedRuns, evaluate_claims
+from edge_se_sampler.bench.paper.verdicts import MIN_DIFFERENCE, ClaimVerdict, evaluate_claims
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.statistics import format_difference
@@ -107,19 +107,18 @@ def _describe_claim(entry: ClaimVerdict) -> str:
         "scenes above 0",
         "verdict",
     ]
-    table = markdown_table(head, map(_comparison_row, entry.rows))
-    return f"**{entry.claim.text}** ({entry.claim.source}; {entry.claim.kind}): {entry.verdict}\n\n{table}"
-
-
-def _comparison_row(row: ComparedRuns) -> list[str]:
-    difference = row.difference
-    return [
-        row.comparison.label,
-        format_difference(difference),
-        str(row.failures),
-        str(row.baseline_failures),
-        f"{difference.runs} of {row.pairs}",
-        decimals(difference.detectable),
-        f"{difference.scenes_better} of {difference.scenes}",
-        row.verdict,
+    rows = [
+        [
+            row.comparison.label,
+            format_difference(row.difference),
+            str(row.failures),
+            str(row.baseline_failures),
+            f"{row.difference.runs} of {row.pairs}",
+            decimals(row.difference.detectable),
+            f"{row.difference.scenes_better} of {row.difference.scenes}",
+            row.verdict,
+        ]
+        for row in entry.rows
     ]
+    title = f"**{entry.claim.text}** ({entry.claim.source}; {entry.claim.kind}): {entry.verdict}"
+    return f"{title}\n\n{markdown_table(head, rows)}"

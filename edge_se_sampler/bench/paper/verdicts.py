@@ -103,50 +103,28 @@ def _compare_tables(strategy: str, *tables: tuple[int, int]) -> list[Comparison]
 
 
 CLAIMS = (
-    Claim(
-        "Where the object is centred, Edge is as stable as Precrop", "sections 4.2.1 and 4.3.1", "not inferior",
-        _compare_in((1, 3), EDGE_AGAINST_PRECROP),
-    ),
-    Claim(
-        "Off centre, Edge trains where Precrop fails", "sections 4.2.2 and 4.3.2", "prevents failures",
-        _compare_in((2, 4), EDGE_AGAINST_PRECROP),
-    ),
-    Claim(
-        "SE raises PSNR whatever the early phase, at equal steps", "section 4.2.1", "better",
-        _compare_in(PAPER_TABLES, WITH_SE),
-    ),
-    Claim(
-        "SE raises PSNR whatever the early phase, at equal time", "ours", "better",
-        [Comparison((n + 8, late), (n, early)) for late, early in WITH_SE.items() for n in PAPER_TABLES],
-    ),
-    Claim(
-        "With few views, Edge gains more over Precrop", "section 4.3.1", "better",
-        _compare_in((3, 5), {EDGE: PRECROP}, minus_table=1),
-    ),
-    Claim(
-        "With few views, SE gains more", "abstract", "better",
-        _compare_in((3, 5), {EDGE_SE: EDGE}, minus_table=1),
-    ),
-    Claim(
-        "Sobel edges are better than Laplacian ones", "section 4.1.4", "better",
-        _compare_tables(EDGE, (1, 13)),
-    ),
-    Claim(
-        "Edge regions get sharper with Edge than with Precrop", "section 5", "better",
-        _compare_in((1, 3), {EDGE: PRECROP}, measure=EDGE_BAND),
-    ),
-    Claim(
-        "Precrop fails because of where the object is, not because it is small", "ours", "prevents failures",
-        _compare_tables(PRECROP, (16, 2)),
-    ),
-    Claim(
-        "A softplus density alone keeps Random from failing", "ours", "prevents failures",
-        _compare_tables(RANDOM, (14, 1), (15, 2)),
-    ),
-    Claim(
-        "Reinitialising dead networks keeps Random from failing", "ours", "prevents failures",
-        _compare_tables(RANDOM, (17, 7), (18, 8)),
-    ),
+    Claim("Where the object is centred, Edge is as stable as Precrop", "sections 4.2.1 and 4.3.1", "not inferior",
+          _compare_in((1, 3), EDGE_AGAINST_PRECROP)),
+    Claim("Off centre, Edge trains where Precrop fails", "sections 4.2.2 and 4.3.2", "prevents failures",
+          _compare_in((2, 4), EDGE_AGAINST_PRECROP)),
+    Claim("SE raises PSNR whatever the early phase, at equal steps", "section 4.2.1", "better",
+          _compare_in(PAPER_TABLES, WITH_SE)),
+    Claim("SE raises PSNR whatever the early phase, at equal time", "ours", "better",
+          [Comparison((n + 8, late), (n, early)) for late, early in WITH_SE.items() for n in PAPER_TABLES]),
+    Claim("With few views, Edge gains more over Precrop", "section 4.3.1", "better",
+          _compare_in((3, 5), {EDGE: PRECROP}, minus_table=1)),
+    Claim("With few views, SE gains more", "abstract", "better",
+          _compare_in((3, 5), {EDGE_SE: EDGE}, minus_table=1)),
+    Claim("Sobel edges are better than Laplacian ones", "section 4.1.4", "better",
+          _compare_tables(EDGE, (1, 13))),
+    Claim("Edge regions get sharper with Edge than with Precrop", "section 5", "better",
+          _compare_in((1, 3), {EDGE: PRECROP}, measure=EDGE_BAND)),
+    Claim("Precrop fails because of where the object is, not because it is small", "ours", "prevents failures",
+          _compare_tables(PRECROP, (16, 2))),
+    Claim("A softplus density alone keeps Random from failing", "ours", "prevents failures",
+          _compare_tables(RANDOM, (14, 1), (15, 2))),
+    Claim("Reinitialising dead networks keeps Random from failing", "ours", "prevents failures",
+          _compare_tables(RANDOM, (17, 7), (18, 8))),
 )  # fmt: skip
 
 

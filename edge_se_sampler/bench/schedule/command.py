@@ -27,28 +27,20 @@ class BenchSchedule(ExperimentCommand):
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.paper.trials import PRESETS, synthetic_scene
         from edge_se_sampler.bench.runner import Experiment
-        from edge_se_sampler.bench.schedule.trials import (
-            LENGTHS,
-            Settings,
-            Trial,
-            list_failure_trials,
-            list_length_trials,
-            run_trial,
-            selection_seeds,
-        )
+        from edge_se_sampler.bench.schedule import trials as schedule
 
         if not (self.parts and self.length_seeds):
             raise InputError("--parts and --length-seeds: give at least one of each")
-        if overlap := sorted(set(self.length_seeds) & set(selection_seeds(LENGTHS[0]))):
+        if overlap := sorted(set(self.length_seeds) & set(schedule.selection_seeds(schedule.LENGTHS[0]))):
             raise InputError(f"--length-seeds: the fixed phase is selected on {overlap}; name others")
-        settings = Settings()
+        settings = schedule.Settings()
 
-        def trials(runs: list[Run]) -> list[Trial]:
-            failures = list_failure_trials(settings, self.seeds) if "failures" in self.parts else []
-            return failures + (list_length_trials(runs, self.length_seeds) if "lengths" in self.parts else [])
+        def trials(runs: list[Run]) -> list[schedule.Trial]:
+            failures = schedule.list_failure_trials(settings, self.seeds) if "failures" in self.parts else []
+            return failures + (schedule.list_length_trials(runs, self.length_seeds) if "lengths" in self.parts else [])
 
-        def arguments(trial: Trial) -> tuple[object, ...]:
+        def arguments(trial: schedule.Trial) -> tuple[object, ...]:
             data = synthetic_scene(trial.table, trial.scene, PRESETS["cpu"], self.workplace)
             return data, self.workplace / "runs"
 
-        return Experiment("schedule", settings, trials, run_trial, arguments)
+        return Experiment("schedule", settings, trials, schedule.run_trial, arguments)
