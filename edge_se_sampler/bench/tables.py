@@ -25,16 +25,19 @@ def decimals(value: float | None, digits: int = 2) -> str:
 def describe_machine(machine: Mapping[str, Any]) -> str:
     """Hardware and versions in a line."""
     versions = ", ".join(f"{name} {machine[name]}" for name in ("python", "torch", "numpy"))
-    return f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads; {versions}"
+    counts = (f"{machine[key]} {key.removesuffix('s') if machine[key] == 1 else key}" for key in ("cores", "threads"))
+    return f"{machine['processor']}, {', '.join(counts)}; {versions}"
 
 
-def describe_command(result: Mapping[str, Any]) -> str:
-    """How to reproduce a result, what that takes, and where it was measured."""
-    hours = sum(run["cpu_seconds"] for run in result["runs"]) / 3600
+def describe_command(*results: Mapping[str, Any]) -> str:
+    """How to reproduce results, what that takes where it is known, and where the last of them was measured."""
+    hours = sum(run.get("cpu_seconds", 0) for result in results for run in result.get("runs", ())) / 3600
+    cost = f"That takes {hours:.1f} CPU hours, shared by as many processes as there are cores. " if hours else ""
+    commands = "\n".join(result["command"] for result in results)
     return (
-        f"`{result['command']}` ({hours:.1f} CPU hours, shared by as many processes as there are cores); it resumes "
-        "where it was stopped. `edge-se bench report` with this folder writes the page and its pictures from "
-        f"result.json.\n\nMeasured on: {describe_machine(result['machine'])}."
+        f"```bash\n{commands}\n```\n\n{cost}A command that was stopped goes on where it was. `edge-se bench report` "
+        "with this folder writes this page and its pictures from the numbers alone.\n\n"
+        f"Measured on: {describe_machine(results[-1]['machine'])}."
     )
 
 

@@ -12,7 +12,7 @@ from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
 from edge_se_sampler.bench.chart.variants import RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.engine.figures import require_pyplot
+from edge_se_sampler.engine.figures import require_pyplot, style_axes
 
 
 def draw_chart(runs: list[Run], baselines: Mapping[str, list[Run]], settings: ChartSettings) -> Any:
@@ -52,7 +52,7 @@ def draw_scenes(runs: list[Run], baselines: Mapping[str, list[Run]], settings: C
     for axis, scene in zip(axes.flat, scenes, strict=False):
         for name, found in shown.items():
             for run in (run for run in found if run["scene"] == scene):
-                _draw_run(axis, run, label=VARIANTS[name].full_label, **styles[name])
+                _draw_run(axis, run, label=VARIANTS[name].full_label, **styles[name] | {"linewidth": 1.2})
                 if failed(run):
                     axis.plot(run["curve"][-1][0], run["curve"][-1][-1], "x", color=styles[name]["color"])
         for run in (run for found in baselines.values() for run in found if run["scene"] == scene):
@@ -95,8 +95,7 @@ def _draw_run(axis: Any, run: Run, **style: Any) -> None:
 
 def _set_time_axis(axis: Any) -> None:
     axis.set_xscale("log")
-    axis.grid(alpha=0.25)
-    axis.spines[["top", "right"]].set_visible(False)
+    style_axes(axis)
     ticks = [tick for tick in (1, 3, 10, 30, 100) if tick < 2 * axis.dataLim.x1]
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
     axis.minorticks_off()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,10 @@ from edge_se_sampler.bench.chart.summary import (
 )
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.bench.chart.variants import COMPARISONS, GROUPS, RECOMMENDED, TOP, VARIANTS
-from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN, failed
+from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.bench.tables import decimals, describe_machine, markdown_table
+from edge_se_sampler.bench.tables import decimals, describe_command, markdown_table
 from edge_se_sampler.engine.figures import save_figure
 
 COLUMNS = {3: "3 s", 7: "7 s", 20: "20 s", 60: "60 s", END: "end"}
@@ -49,24 +49,21 @@ def draw(folder: Path, workplace: Path | None) -> None:
 
 def describe(folder: Path) -> str:
     """The README.md; remarks by hand, which no number of the result shows, are in notes.md."""
-    result, baselines, commands = _read(folder)
+    result, baselines, baseline_results = _read(folder)
     runs, settings, notes = result["runs"], ChartSettings(**result["settings"]), folder / "notes.md"
     return fill_template(
         __file__,
         folder,
-        seconds=settings.seconds,
-        time=settings.unit,
+        **result["settings"],
+        unit=settings.unit,
         number=len(runs),
-        image_size=settings.image_size,
-        collapsed=COLLAPSED_SHARE,
-        min_gain=MIN_GAIN,
+        failure_rule=FAILURE_RULE,
         **{group: _describe_group(runs, group, baselines) for group in GROUPS},
         comparisons=_compare_pairs(runs),
         envelope=_describe_envelope(runs),
         every_scene=_compare_scenes(runs, baselines),
         notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
-        commands="\n".join([*commands, result["command"]]),
-        machine=describe_machine(result["machine"]),
+        reproduce=describe_command(*baseline_results, result),
     )
 
 
@@ -76,12 +73,11 @@ def tables(folder: Path) -> dict[str, str]:
     return {"methods": _group_table(result["runs"], "methods", baselines, costs=False)}
 
 
-def _read(folder: Path) -> tuple[dict[str, Any], Baselines, list[str]]:
-    """The result, the baselines, and the commands that trained them."""
+def _read(folder: Path) -> tuple[dict[str, Any], Baselines, Iterable[dict[str, Any]]]:
+    """The result, the baselines' runs, and their results."""
     result = read_result(folder / "result.json")
     baselines = read_baselines(folder, ChartSettings(**result["settings"]))
-    runs = {label: baseline["runs"] for label, baseline in baselines.items()}
-    return result, runs, [baseline["command"] for baseline in baselines.values()]
+    return result, {label: baseline["runs"] for label, baseline in baselines.items()}, baselines.values()
 
 
 def _comparable_with_group(runs: list[Run], group: str) -> dict[str, list[Run]]:
