@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -13,6 +13,10 @@ from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+
+if TYPE_CHECKING:
+    from edge_se_sampler.engine.config import TrainerConfig
+    from edge_se_sampler.engine.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -62,20 +66,8 @@ class Scenes:
         from edge_se_sampler.engine.progress import Progress
 
         with Progress(0, "rendering scenes") as progress:
-            paths = make_scenes(
-                self.out,
-                self.names,
-                size=self.size,
-                num_train=self.num_train,
-                num_val=self.num_val,
-                num_test=self.num_test,
-                placement=self.placement,
-                offset=self.offset,
-                seed=self.seed,
-                progress=progress.update,
-            )
-        for path in paths:
-            print(path)
+            paths = make_scenes(**vars(self), progress=progress.update)
+        print(*paths, sep="\n")
 
 
 @dataclass(frozen=True)
@@ -96,9 +88,8 @@ class Offcenter:
         from edge_se_sampler.engine.progress import Progress
 
         with Progress(0, "moving views off the center") as progress:
-            paths = offcenter(self.data, self.out, self.shift, self.pad, progress.update)
-        for path in paths:
-            print(path)
+            paths = offcenter(**vars(self), progress=progress.update)
+        print(*paths, sep="\n")
 
 
 @dataclass(frozen=True)
@@ -107,28 +98,37 @@ class Train:
 
 
 @dataclass(frozen=True)
-class Resume:
-    """Continue an interrupted run in place, under its own settings."""
+class _RunCommand:
+    """A command on a run."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
+
+    def _load(self) -> tuple[RunFolder, TrainerConfig]:
+        """The run, and its settings; InputError if there is none."""
+        from edge_se_sampler.engine.run_folder import RunFolder
+
+        run = RunFolder(self.run_folder)
+        return run, run.config(method_configs())
+
+
+@dataclass(frozen=True)
+class Resume(_RunCommand):
+    """Continue an interrupted run in place, under its own settings."""
+
     max_seconds: float | None = None
     """Stop this session after so many seconds."""
 
     def run(self) -> None:
-        from edge_se_sampler.engine.run_folder import RunFolder
         from edge_se_sampler.engine.session import prepare_resume
 
-        run = RunFolder(self.run_folder)
-        train(prepare_resume(run, run.config(method_configs()), self.max_seconds))
+        train(prepare_resume(*self._load(), self.max_seconds))
 
 
 @dataclass(frozen=True)
-class Eval:
+class Eval(_RunCommand):
     """Measure a run on its held-out views."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
     output_path: Path = Path("eval.json")
     """The json file to write."""
     render_output_path: Path | None = None
@@ -136,19 +136,15 @@ class Eval:
 
     def run(self) -> None:
         from edge_se_sampler.engine.evaluation import evaluate_run
-        from edge_se_sampler.engine.run_folder import RunFolder
 
-        run = RunFolder(self.run_folder)
-        results = evaluate_run(run, run.config(method_configs()), self.output_path, self.render_output_path)
+        results = evaluate_run(*self._load(), self.output_path, self.render_output_path)
         print(f"PSNR {results['psnr']:.2f} dB over {results['num_images']} views; see {self.output_path}")
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(_RunCommand):
     """Render a run as a video."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
     output_path: Path = Path("render.gif")
     """The video to write, .gif or .mp4 (extra [video])."""
     kind: Literal["spiral", "test"] = "spiral"
@@ -159,12 +155,9 @@ class Render:
     """Frame rate of the video."""
 
     def run(self) -> None:
-        from edge_se_sampler.engine.run_folder import RunFolder
         from edge_se_sampler.engine.video import render_run
 
-        run = RunFolder(self.run_folder)
-        config = run.config(method_configs())
-        render_run(run, config, self.output_path, self.kind, self.num_frames, self.frames_per_second)
+        render_run(*self._load(), self.output_path, self.kind, self.num_frames, self.frames_per_second)
         print(self.output_path)
 
 
@@ -243,19 +236,9 @@ class Bench:
     """Run the experiments and timings behind the published numbers."""
 
 
-COMMANDS: dict[str, type] = {
-    "demo": Demo,
-    "scenes": Scenes,
-    "offcenter": Offcenter,
-    "train": Train,
-    "resume": Resume,
-    "eval": Eval,
-    "render": Render,
-    "show": Show,
-    "inspect": Inspect,
-    "methods": Methods,
-    "bench": Bench,
-}
+_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Show, Inspect, Methods, Bench)
+COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
+"""Name -> command."""
 
 
 def train(trainer: Any) -> None:

@@ -116,18 +116,15 @@ class TrainerConfig(InstantiateConfig):
         check_value("optimizer.eps", optimizer.eps, 0 <= optimizer.eps < INFINITY, "at least 0")
         model.check("pipeline.model.")
         if manager.skip_empty_rays and not model.needs_grid:
-            raise InputError(
-                "--pipeline.datamanager.skip-empty-rays has no effect here; add "
-                "--pipeline.model.empty-space-skipping True"
-            )
+            remedy = "add --pipeline.model.empty-space-skipping True"
+            raise InputError(f"--pipeline.datamanager.skip-empty-rays has no effect here; {remedy}")
         if not isinstance(model, LeanModelConfig):
             return
         if self.reinit_dead:
             raise InputError("--reinit-dead: this model's density is never 0, it cannot die; leave the flag out")
         if getattr(manager.pixel_sampler, "error_source", "fine") == "coarse":
-            raise InputError(
-                "--pipeline.datamanager.pixel-sampler.error-source is coarse: this model has no coarse network"
-            )
+            flag = "--pipeline.datamanager.pixel-sampler.error-source"
+            raise InputError(f"{flag} is coarse: this model has no coarse network")
 
 
 @dataclass(frozen=True)

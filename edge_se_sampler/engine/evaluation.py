@@ -36,24 +36,21 @@ def evaluate(
         rows.append({"name": picture.name, **compute_metrics(rendered, picture.image, model.config.background_level)})
         if on_view is not None:
             on_view(i, picture, rendered)
-    result: dict[str, Any] = {}
-    for key in rows[0]:
-        values = [row[key] for row in rows if row[key] is not None]
-        if key not in ("name", "mse"):
-            result[key] = float(np.mean(values)) if values else None
-    result["psnr_std"] = float(np.std([row["psnr"] for row in rows]))
-    result["psnr_pooled"] = psnr(float(np.mean([row["mse"] for row in rows])))
-    return result | {"lpips": None, "num_images": len(rows), "images": rows}
+    columns = {key: [row[key] for row in rows if row[key] is not None] for key in rows[0]}
+    averaged = [key for key in columns if key not in ("name", "mse")]
+    return {key: float(np.mean(columns[key])) if columns[key] else None for key in averaged} | {
+        "psnr_std": float(np.std(columns["psnr"])),
+        "psnr_pooled": psnr(float(np.mean(columns["mse"]))),
+        "lpips": None,
+        "num_images": len(rows),
+        "images": rows,
+    }
 
 
 def evaluate_run(
     run: RunFolder, config: TrainerConfig, output_path: Path, render_output_path: Path | None
 ) -> dict[str, Any]:
-    """Evaluate a run's last checkpoint on its held-out views, and write a json with the keys of nerfstudio's eval.
-
-    Raises:
-        InputError: a bad run, or an output that cannot be written.
-    """
+    """Evaluate a run's last checkpoint on its held-out views, and write a json with the keys of nerfstudio's eval."""
     check_output(output_path)
     model, checkpoint = load_model(run, config)
     pictures = to_pictures(read_test_views(config))
@@ -68,11 +65,6 @@ def evaluate_run(
 
     with Progress(len(pictures), "evaluating") as progress:
         results = evaluate(model, pictures, report)
-    content = {
-        "experiment_name": config.experiment_name,
-        "method_name": config.method_name,
-        "checkpoint": str(checkpoint),
-        "results": results,
-    }
-    write_json(output_path, content)
+    names = {"experiment_name": config.experiment_name, "method_name": config.method_name}
+    write_json(output_path, names | {"checkpoint": str(checkpoint), "results": results})
     return results

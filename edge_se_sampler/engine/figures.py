@@ -10,11 +10,7 @@ from edge_se_sampler.errors import InputError
 
 
 def require_pyplot():
-    """Import matplotlib's pyplot with the backend that draws to files.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Matplotlib's pyplot with the backend that draws to files; InputError if it is not installed."""
     try:
         import matplotlib
     except ImportError:
@@ -33,11 +29,7 @@ def style_axes(*axes) -> None:
 
 
 def save_figure(figure, path: Path) -> None:
-    """Write a figure as PNG and close it.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write a figure as PNG and close it; InputError if it cannot be written."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120)
     require_pyplot().close(figure)

@@ -1,9 +1,8 @@
 """New initial weights for dead networks.
 
-With a ReLU a network whose raw density is negative at every sample has no gradient left: no sampler and no number
-of steps can help it. Its initial weights may be so already, or training may bring it there. Coarse and fine network are
-reinitialized independently: with a dead coarse network the fine one trains on evenly spread samples, with a dead fine
-one nothing is rendered.
+With a ReLU, a network whose raw density is negative at every sample has no gradient: no sampler and no number of steps
+can help it. It may be so from its initial weights, or training may bring it there. Coarse and fine network die, and are
+reinitialized, independently of each other.
 """
 
 from __future__ import annotations
@@ -50,11 +49,7 @@ class DeadNetworkReset:
         self.used_sub_seeds = 0
 
     def after_backward(self) -> dict[str, int]:
-        """Look at a step's gradients, and reinitialize what is dead.
-
-        Returns:
-            the name of every network that was reinitialized -> its sub-seed.
-        """
+        """Look at a step's gradients, reinitialize what is dead, and return each such network's name -> sub-seed."""
         suspects = []
         for name in self.model.networks:
             gradient = getattr(self.model, name).density.weight.grad
@@ -76,10 +71,7 @@ class DeadNetworkReset:
 
     def state_dict(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {
-            "steps_without_gradient": dict(self.steps_without_gradient),
-            "used_sub_seeds": self.used_sub_seeds,
-        }
+        return {"steps_without_gradient": dict(self.steps_without_gradient), "used_sub_seeds": self.used_sub_seeds}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
