@@ -25,13 +25,9 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 class VanillaDataManager:
-    """Holds the training images and asks a pixel sampler which of their pixels to train on.
+    """Holds the training images, on the CPU as uint8, and asks a pixel sampler which of their pixels to train on.
 
-    Args:
-        config: its settings, train_num_rays_per_batch resolved.
-        views: the training views.
-        device: of rays and batches; the images stay on the CPU as uint8.
-        background_color: RGB behind transparent pixels, for samplers that look at colors.
+    `config` has train_num_rays_per_batch resolved; `background_color` (RGB) is for samplers that look at colors.
     """
 
     def __init__(

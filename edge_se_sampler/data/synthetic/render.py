@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_se_sampler.data.synthetic.cameras import Camera
-from edge_se_sampler.data.synthetic.linear import Array, apply, unit
+from edge_se_sampler.data.synthetic.linear import apply, unit
 from edge_se_sampler.data.synthetic.scene import Scene
 from edge_se_sampler.data.synthetic.shading import radiance
 from edge_se_sampler.data.synthetic.visibility import NOTHING, first_hits
@@ -19,15 +19,9 @@ SAMPLES_PER_AXIS = 4
 _BATCH = 1 << 16  # points shaded together: bounds the memory
 _BRIGHTEST = 4.0  # radiance of one sample is clipped here, so that a glint does not bleach its whole pixel
 
-
-def _srgb_steps() -> Array:
-    """Linear values (255,) at which the 8-bit sRGB code rises by one."""
-    encoded = [(code - 0.5) / 255 for code in range(1, 256)]
-    linear = [e / 12.92 if e <= 0.04045 else ((e + 0.055) / 1.055) ** 2.4 for e in encoded]
-    return np.round(linear, 14)  # the same on every platform's pow
-
-
-_SRGB_STEPS = _srgb_steps()
+_ENCODED = [(code - 0.5) / 255 for code in range(1, 256)]
+# Linear values (255,) at which the 8-bit sRGB code rises by one; rounded, they are the same on every platform's pow
+_SRGB_STEPS = np.round([e / 12.92 if e <= 0.04045 else ((e + 0.055) / 1.055) ** 2.4 for e in _ENCODED], 14)
 
 
 def render(scene: Scene, camera: Camera) -> NDArray[np.uint8]:

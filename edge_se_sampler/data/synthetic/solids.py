@@ -29,10 +29,9 @@ class Kind(IntEnum):
 
 
 def hit_distance(kind: int, taper: Array, origin: Any, direction: Any, beyond: float) -> Array:
-    """Smallest t > `beyond` at which each ray meets the solid's surface; inf where it never does.
+    """Smallest t > `beyond` at which each ray meets the solid's surface, the far side from inside; inf: never.
 
-    `origin` and `direction` are three arrays each (or arrays (3, ...)) that broadcast together; `taper` is (2,) and
-    read for a frustum only. Rays that start inside meet the far side.
+    `origin` and `direction` are three arrays each (or arrays (3, ...)) that broadcast together; `taper` (2,).
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel rays give inf or nan, which every test rejects
         if kind == Kind.SPHERE:
