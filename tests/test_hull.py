@@ -29,7 +29,6 @@ from edge_se_sampler.occupancy.hull import (
     find_box,
     find_hit_pixels,
     find_silhouettes,
-    pixel_footprint,
     project_cells,
 )  # fmt: skip
 from edge_se_sampler.occupancy.scene_analysis import MAX_GRID_CELLS, pick_pixels
@@ -86,7 +85,7 @@ def with_masks(views: Views, change: Callable[[int, np.ndarray], np.ndarray]) ->
 
 def hull_of(views: Views, voxel_size_px: float = 1.6) -> Hull:
     box = find_box(views, 2, 6)
-    hull = carve(views, find_silhouettes(views), box, voxel_size_px * pixel_footprint(views, box))
+    hull = carve(views, find_silhouettes(views), box, voxel_size_px * box.pixel_footprint)
     assert hull is not None
     return hull
 
@@ -117,7 +116,7 @@ def test_the_box_is_where_the_cameras_look_and_as_large_as_their_depths() -> Non
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3], axis=1)
     np.testing.assert_allclose(box.center, (5, -2, 1), atol=1e-9)
     assert box.half_extent == pytest.approx(max((6 - distance).max(), (distance - 2.5).max()))
-    assert pixel_footprint(moved, box) == pytest.approx(np.median(distance) / 137)
+    assert box.pixel_footprint == pytest.approx(np.median(distance) / 137)
 
 
 @pytest.mark.parametrize("apart", [0.02, -0.005])
@@ -133,7 +132,7 @@ def test_cameras_side_by_side_look_at_what_is_before_them(apart: float) -> None:
     box = find_box(side, 2, 6)
     np.testing.assert_allclose(box.center, (0, 0, -1), atol=0.01)  # 4 ahead of them
     assert box.half_extent == pytest.approx(2, abs=0.1)
-    assert pixel_footprint(side, box) == pytest.approx(4 / 137, rel=0.01)
+    assert box.pixel_footprint == pytest.approx(4 / 137, rel=0.01)
 
 
 def test_a_rectangle_holds_all_of_its_cell() -> None:
@@ -283,7 +282,7 @@ def test_a_cell_behind_a_camera_is_not_seen_by_it() -> None:
     """One camera at the side of a box far larger than its depths: half of the cells lie behind it."""
     views = views_of(rods(), count=1)
     pose = views.cameras.camera_to_worlds[0].numpy()
-    hull = carve(views, {}, Box(pose[:, 3], 1.0), 0.1)
+    hull = carve(views, {}, Box(pose[:, 3], 1.0, 0.1), 0.1)
     assert hull is not None
     centers = hull.aabb_min + (np.argwhere(hull.cells) + 0.5) * hull.cell_size
     depth = -(centers - pose[:, 3]) @ pose[:, 2]
@@ -336,9 +335,9 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
 def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:
     views = views_of(rods())
     fine = analyze_views(views, LeanModelConfig(voxel_size_px=1.6))
-    assert fine.hull.cell_size == pytest.approx(1.6 * fine.pixel_footprint)
+    assert fine.hull.cell_size == pytest.approx(1.6 * fine.box.pixel_footprint)
     many = analyze_views(views_of(rods(), 800, 4), LeanModelConfig(voxel_size_px=0.2))
-    assert many.hull.cell_size > 0.2 * many.pixel_footprint
+    assert many.hull.cell_size > 0.2 * many.box.pixel_footprint
     assert 0.05 * MAX_OCCUPIED_CELLS < many.hull.cells.sum() < MAX_OCCUPIED_CELLS
 
 
@@ -350,7 +349,7 @@ def test_where_nothing_is_carved_cells_begin_large_enough_to_be_subdivided(size:
     assert analysis.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS / 8
     assert analysis.hull.cells.size * 8**analysis.max_level < MAX_GRID_CELLS
     if size == 100:  # as near as halving comes to what a pixel asks
-        assert 2**-0.5 < analysis.hull.cell_size / 2**max_level / analysis.pixel_footprint < 2**0.5
+        assert 2**-0.5 < analysis.hull.cell_size / 2**max_level / analysis.box.pixel_footprint < 2**0.5
     for unpruned in (
         analyze_views(views, LeanModelConfig(cull_by_density=False)),
         analyze_views(views, LeanModelConfig(cull_by_alpha=False, cull_by_density=False)),
@@ -401,7 +400,5 @@ def test_picked_pixels_are_spread_over_masks_of_any_size() -> None:
 
 def test_all_pixels_of_a_camera_inside_the_hull_are_found() -> None:
     views = views_of(rods())
-    box = Box(np.zeros(3), 2.0)
     around = Hull(np.full(3, -6.0), 12.0, np.ones((1, 1, 1), dtype=bool))
     assert all(hit.all() for hit in find_hit_pixels(views, around))
-    assert box.half_extent == 2

@@ -352,12 +352,12 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     analysis = analyze_views(read_blender(larger, "train"), LeanModelConfig())
     assert f"{analysis.hull.cells.sum():,} of" in findings["cells"]
     assert findings["silhouettes"].startswith("6 of 6 views")
-    assert findings["pixel"].startswith(f"{analysis.pixel_footprint:.4f}")
+    assert findings["pixel"].startswith(f"{analysis.box.pixel_footprint:.4f}")
     hit = find_hit_pixels(read_blender(larger, "train"), analysis.hull)
     assert findings["rays"].startswith(f"{100 * np.mean(hit):.1f} %")
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
     assert findings["sampling"].startswith("uniform")
-    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.pixel_footprint
+    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.box.pixel_footprint
     assert wave > 2  # pixels: no more than the cameras resolve
     assert findings["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
     assert findings["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"

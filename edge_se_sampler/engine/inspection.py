@@ -9,10 +9,11 @@ import torch
 
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
+from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
 from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.hull import find_hit_pixels
+from edge_se_sampler.occupancy.hull import Hull, find_hit_pixels
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
 from edge_se_sampler.sampling.edges import unit_float
 
@@ -21,10 +22,7 @@ NUM_VIEWS = 3
 
 
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
-    """What is derived from training views, one finding a line; draws it too.
-
-    Args:
-        config: of the model; its size may be auto.
+    """What is derived from training views, one finding a line; draws it too. The config's size may be auto.
 
     Raises:
         InputError: a setting is out of its range, matplotlib is missing, or the picture cannot be written.
@@ -35,7 +33,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     analysis = analyze_views(views, config)
     hit_pixels = find_hit_pixels(views, analysis.hull)
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
-    _draw_hull(axes[0], analysis)
+    _draw_hull(axes[0], analysis.hull)
     _draw_views(axes[1], views, hit_pixels)
     figure.tight_layout()
     save_figure(figure, path)
@@ -46,7 +44,7 @@ def _findings(
     views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
 ) -> dict[str, str]:
     """Each quantity's value, and where it comes from."""
-    hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.pixel_footprint
+    hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.box.pixel_footprint
     num_views, num_occupied = len(views.images), hull.cells.sum()
     sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
     # large cells may reach beyond the box
@@ -58,7 +56,7 @@ def _findings(
     samples = OccupancyGrid.from_hull(hull).march(rays, step, None, (config.near, config.far))
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
     center = ", ".join(f"{value + 0.0:.2f}" for value in box.center.round(2))
-    share = np.mean(np.concatenate([pixels.ravel() for pixels in hit_pixels]))
+    share = np.mean(np.concatenate([hit.ravel() for hit in hit_pixels]))
     wave = 2 * np.pi * float(analysis.grid().half_extent) / 2 ** (preset.position_frequencies - 1) / footprint
     return {
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
@@ -80,11 +78,11 @@ def _findings(
     }
 
 
-def _draw_hull(axes: np.ndarray, analysis: SceneAnalysis) -> None:
+def _draw_hull(axes: np.ndarray, hull: Hull) -> None:
     """The hull seen along three axes: how many cells lie one after another."""
-    hull = analysis.hull
     ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
-    for axis, along, (right, up) in zip(axes, (1, 0, 2), ((0, 2), (1, 2), (0, 1)), strict=True):
+    for axis, along in zip(axes, (1, 0, 2), strict=True):
+        right, up = (other for other in range(3) if other != along)
         extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
         axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
         axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
@@ -94,7 +92,6 @@ def _draw_views(axes: np.ndarray, views: Views, hit_pixels: list[np.ndarray]) ->
     """Some views, with the pixels dark whose rays miss the hull."""
     chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
     for axis, k in zip(axes, chosen, strict=True):
-        image = unit_float(views.images[k])
-        color = image[..., :3] * image[..., 3:] + 1 - image[..., 3:] if image.shape[2] == 4 else image
+        color = composite_on(unit_float(views.images[k]))
         axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
         axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")

@@ -35,11 +35,8 @@ class Pipeline:
     def build(
         cls, config: TrainerConfig, views: Views, device: str, saved_grid: OccupancyGrid | None = None
     ) -> Pipeline:
-        """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own.
-
-        Raises:
-            InputError: the scene is not the saved grid's.
-        """
+        """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own. InputError
+        if the checkpoint's grid is another scene's."""
         model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
         grid, has_masks = saved_grid, False
         if model_config.needs_grid:
@@ -74,11 +71,7 @@ def build_model(config: TrainerConfig, device: str, grid: OccupancyGrid | None =
 
 
 def saved_grid(weights: Mapping[str, Tensor]) -> OccupancyGrid | None:
-    """The occupancy grid in a checkpoint's weights, None if it has none.
-
-    Raises:
-        InputError: another version wrote it.
-    """
+    """The occupancy grid in a checkpoint's weights, None if it has none; InputError if another version wrote it."""
     state = {key.removeprefix("grid."): value for key, value in weights.items() if key.startswith("grid.")}
     try:
         return OccupancyGrid.from_state(state) if state else None
@@ -87,11 +80,7 @@ def saved_grid(weights: Mapping[str, Tensor]) -> OccupancyGrid | None:
 
 
 def load_weights(model: RayModel, weights: Mapping[str, Tensor]) -> None:
-    """Give a model a checkpoint's weights; its grid is the checkpoint's, see `saved_grid`.
-
-    Raises:
-        InputError: they are another model's.
-    """
+    """Give a model, on its `saved_grid`, a checkpoint's weights; InputError if they are another model's."""
     try:
         model.load_state_dict(weights)
     except RuntimeError as problem:

@@ -10,14 +10,8 @@ from edge_se_sampler.models.config import apply_preset, decide_size
 
 
 def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
-    """The config with nothing left open; a resolved one stays as it is, whatever the views.
-
-    Args:
-        views: to train on; the longest side of their images decides the model's size.
-
-    Raises:
-        InputError: a value is out of its range.
-    """
+    """The config with nothing left open, its size decided by the training views; a resolved one stays as it is,
+    whatever the views. InputError if a value is out of its range."""
     data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
     config = replace(config, pipeline=replace(config.pipeline, model=model))
     preset = config.preset

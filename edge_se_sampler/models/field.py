@@ -2,6 +2,7 @@
 
 m   points that are evaluated, packed: point i lies on ray ray_indices[i]
 n   rays; what depends on the direction alone is computed once for each
+L   number of frequencies that encode a vector, 2^0 .. 2^(L-1); as in NeRF's code, without its paper's factor pi
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from edge_se_sampler.models.config import NeRFModelConfig
-from edge_se_sampler.models.encoding import encoded_size, positional_encoding
 
 SKIP_LAYER = 5
 """Number of the layer, from 0, that takes the encoded position again (a skip connection)."""
@@ -23,14 +23,13 @@ class NeRFField(nn.Module):
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator) -> None:
         super().__init__()
-        preset = config.preset
+        preset, width = config.preset, config.preset.width
         self.position_frequencies = preset.position_frequencies
         self.direction_frequencies = preset.direction_frequencies
         self.softplus = config.density_activation == "softplus"
-        width, depth = preset.width, preset.depth
         encoded = encoded_size(3, self.position_frequencies)
-        widths = [encoded] + [width + encoded if i == SKIP_LAYER else width for i in range(1, depth)]
-        self.layers = nn.ModuleList(linear(size, width) for size in widths)
+        in_sizes = [encoded] + [width + encoded if i == SKIP_LAYER else width for i in range(1, preset.depth)]
+        self.layers = nn.ModuleList(linear(in_size, width) for in_size in in_sizes)
         self.density = linear(width, 1)
         self.feature = linear(width, width)
         self.view = linear(width + encoded_size(3, self.direction_frequencies), width // 2)
@@ -75,6 +74,18 @@ class NeRFField(nn.Module):
         else:
             h = h + per_ray[ray_indices]
         return F.relu(h, inplace=True)
+
+
+def encoded_size(dimensions: int, frequencies: int) -> int:
+    """Length of the encoding of a d-vector: d (1 + 2L)."""
+    return dimensions * (1 + 2 * frequencies)
+
+
+def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
+    """(..., d) -> (..., d (1 + 2L)): x itself, then all sines, then all cosines (NeRF, equation 4)."""
+    scale = 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
+    angles = (x[..., None, :] * scale[:, None]).flatten(-2)
+    return torch.cat((x, torch.sin(angles), torch.cos(angles)), dim=-1)
 
 
 def linear(in_size: int, out_size: int) -> nn.Linear:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +20,6 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import InfoNeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.rendering import opacity
-from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 TINY = 1e-10
 
@@ -32,18 +30,10 @@ def ray_pdf(alpha: Tensor) -> Tensor:
 
 
 def ray_entropy(alpha: Tensor, accumulation: Tensor, threshold: float) -> Tensor:
-    """H of rays that hit something, 0 of the others.
-
-    Args:
-        alpha: (n, s).
-        accumulation: (n, 1); a ray hits where it is above the threshold, through which no gradient flows.
-
-    Returns:
-        (n,) in bits, 0 .. log2(s).
-    """
+    """H (n,) in bits, 0 .. log2(s), of alphas (n, s); 0 for rays that hit nothing, whose accumulation (n, 1) is at most
+    the threshold. No gradient flows through the accumulation."""
     p = ray_pdf(alpha)
-    entropy = -(p * torch.log2(p + TINY)).sum(dim=1)
-    return entropy * (accumulation.detach()[:, 0] > threshold)
+    return -(p * torch.log2(p + TINY)).sum(dim=1) * (accumulation.detach()[:, 0] > threshold)
 
 
 def information_gain(alpha: Tensor, rotated_alpha: Tensor) -> Tensor:
@@ -72,14 +62,8 @@ class InfoNeRFModel(NeRFModel):
     """NeRF with ray entropy minimization on unseen rays and information gain reduction on all."""
 
     config: InfoNeRFModelConfig
-
-    def __init__(
-        self, config: InfoNeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None
-    ) -> None:
-        super().__init__(config, rng, grid)
-        self.num_unseen_rays = config.preset.num_unseen_rays
-        self.gain_weight = 0.0
-        self.rotation = torch.eye(3)
+    gain_weight = 0.0
+    rotation = torch.eye(3)
 
     def begin_step(self, step: int, seed: int) -> None:
         """As `RayModel`; draws the step's small rotation, and decays the weight of the information gain."""

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.encoding import encoded_size, positional_encoding
-from edge_se_sampler.models.field import initialize_linear, linear
+from edge_se_sampler.models.field import encoded_size, initialize_linear, linear, positional_encoding
 from edge_se_sampler.models.packed_rendering import (
     accumulate_along_rays,
     expand_to_samples,
@@ -65,16 +64,12 @@ class LeanField(nn.Module):
     def forward(
         self, positions: Tensor, features: Tensor, directions: Tensor, ray_starts: Tensor, ray_indices: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Evaluate packed samples.
+        """Raw density (m,) and color (m, 3) in [0, 1] of packed samples (`Samples`).
 
         Args:
             positions: (m, 3), -1 .. 1 along the longest edge of the box.
             features: (m, F).
             directions: (n, 3) unit.
-            ray_starts, ray_indices: (n,) and (m,) int64, see `Samples`.
-
-        Returns:
-            raw density (m,), color (m, 3) in [0, 1].
         """
         h = torch.cat((positional_encoding(positions, self.position_frequencies), features), dim=1)
         for layer in self.layers:
@@ -129,17 +124,13 @@ class LeanModel(RayModel):
             return
         fraction = REACTIVATION_FRACTION / 2 ** int(grid.level)
         reactivated = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < fraction
-        dense = grid.prune(-math.log1p(-ALPHA_THRESHOLD) / float(grid.finest_cell_size), reactivated)
+        min_density = -math.log1p(-ALPHA_THRESHOLD) / float(grid.initial_cell_size / 2**grid.max_level)
+        dense = grid.prune(min_density, reactivated)
         self._refine(dense, surface)
 
     def _refine(self, dense: Tensor, surface: Tensor) -> None:
         """Subdivide the grid, at level 0 always, later when its cells are few enough; else refine surface cells that
-        pruning had missed.
-
-        Args:
-            dense: (X, Y, Z) bool: cells that pruning has kept.
-            surface: (X, Y, Z) bool: cells that count as surface.
-        """
+        pruning had missed. Both (X, Y, Z) bool: cells that pruning has kept, and those that count as surface."""
         grid, features, level = self.grid, self.features, int(self.grid.level)
         if level < grid.max_level and (level == 0 or 8 * dense.sum() <= MAX_OCCUPIED_CELLS):
             grid.subdivide() if features is None else features.refine(upsample(dense) & grid.static_mask_at(level + 1))

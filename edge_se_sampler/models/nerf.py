@@ -22,11 +22,11 @@ another (equally good) training run."""
 class NeRFModel(RayModel):
     """Coarse and fine networks, stratified and importance samples. `rng` draws the initial weights."""
 
+    config: NeRFModelConfig
     networks = ("coarse", "fine")
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None) -> None:
         super().__init__(config, grid)
-        self.config = config
         self.num_coarse_samples = config.preset.num_coarse_samples
         self.num_importance_samples = config.preset.num_importance_samples
         self.coarse = NeRFField(config, rng)
@@ -47,11 +47,11 @@ class NeRFModel(RayModel):
         uniform = self.uniform(len(t), count) if self.training else even
         further = importance((t[:, 1:] + t[:, :-1]) / 2, weights.detach()[:, 1:-1], uniform)
         t = torch.sort(torch.cat((t, further), dim=1)).values
-        weights, rgb, samples = self._render(self.fine, rays, t, background)
+        weights, rgb, (density, delta) = self._render(self.fine, rays, t, background)
         accumulation = weights.sum(1, keepdim=True)
         depth = (weights * t).sum(1, keepdim=True) + (1 - accumulation) * t[:, -1:]
-        fine = {"rgb_fine": rgb, "accumulation_fine": accumulation, "depth_fine": depth}
-        return outputs | fine | dict(zip(("density_fine", "delta_fine"), samples, strict=True))
+        outputs |= {"rgb_fine": rgb, "accumulation_fine": accumulation, "depth_fine": depth}
+        return outputs | {"density_fine": density, "delta_fine": delta}
 
     def coarse_squared_error(self, rays: RayBundle, image: Tensor) -> Tensor:
         """(n,) `squared_error` of the coarse colors, without evaluating the fine network."""

@@ -19,13 +19,13 @@ class RayModel(nn.Module, ABC):
 
     networks: tuple[str, ...] = ("fine",)
     """Names of the networks, each an attribute; the colors of "fine" are the model's."""
-    num_unseen_rays = 0
-    """Rays a step, of cameras between the training views, that `auxiliary_loss` regularizes."""
 
     def __init__(self, config: ModelConfig, grid: OccupancyGrid | None) -> None:
         super().__init__()
         self.config = config
         self.grid = grid
+        self.num_unseen_rays = config.preset.num_unseen_rays
+        """Rays a step, of cameras between the training views, that `auxiliary_loss` regularizes."""
         self.random = torch.Generator()
         """Source of jitter, noise and random backgrounds; seeded at every training step."""
         self.background_fn: Callable[[RayBundle], Tensor] | None = None
@@ -69,12 +69,8 @@ class RayModel(nn.Module, ABC):
         self.random.manual_seed(seed)
 
     def squared_error(self, outputs: dict[str, Tensor], image: Tensor, network: str = "fine") -> Tensor:
-        """(n,) squared error of every ray, summed over channels (NeRF, equation 6).
-
-        Args:
-            outputs: of `forward`.
-            image: (n, 3|4) straight-alpha pixels in [0, 1].
-        """
+        """(n,) squared error of every ray, summed over channels (NeRF, equation 6): outputs of `forward` against
+        straight-alpha pixels (n, 3|4) in [0, 1]."""
         return (outputs[f"rgb_{network}"] - target_colors(image, outputs["background"])).square().sum(dim=1)
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:

@@ -106,11 +106,6 @@ class OccupancyGrid(nn.Module):
         return self.cell_size * 2**self.level
 
     @property
-    def finest_cell_size(self) -> Tensor:
-        """h at the highest level."""
-        return self.initial_cell_size / 2**self.max_level
-
-    @property
     def static_mask(self) -> Tensor:
         """(X, Y, Z) bool: cells that hold any of the hull; the others are never occupied."""
         return self.static_mask_at(int(self.level))
@@ -196,23 +191,13 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def update_max_density(self, samples: Samples, density: Tensor) -> None:
-        """Keep the largest density seen in each cell.
-
-        Args:
-            density: (m,) of the samples.
-        """
+        """Keep the largest density seen in each cell, by the densities (m,) of samples."""
         self.max_density.view(-1).scatter_reduce_(0, samples.cell_indices, density.detach(), "amax")
 
     @torch.no_grad()
     def prune(self, min_density: float, reactivated: Tensor) -> Tensor:
         """Keep occupied only cells where more than min_density was seen since the last pruning, their neighbors (a
-        surface may move), and those to be reactivated.
-
-        Args:
-            reactivated: (X, Y, Z) bool: cells that are occupied whatever was seen.
-
-        Returns:
-            (X, Y, Z) bool: the cells that are occupied for what was seen.
+        surface may move), and those to be reactivated, (X, Y, Z) bool. Returns the former two, (X, Y, Z) bool.
         """
         dense = dilate(self.max_density > min_density) & self.static_mask
         self.occupied.copy_(dense | (reactivated & self.static_mask))

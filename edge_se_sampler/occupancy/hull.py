@@ -81,6 +81,8 @@ class Box:
     """(3,) float64, world units."""
     half_extent: float
     """Half its edge, world units."""
+    pixel_footprint: float
+    """Median size of a pixel at the center, world units: depth / focal length."""
 
 
 def find_box(views: Views, near: float, far: float) -> Box:
@@ -91,28 +93,17 @@ def find_box(views: Views, near: float, far: float) -> Box:
     Args:
         near, far: depths between which rays are sampled, world units.
     """
-    position, forward = _optical_axes(views.cameras)
+    poses = views.cameras.camera_to_worlds.numpy()
+    position, forward = poses[:, :, 3], -poses[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     center = np.linalg.lstsq(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=None)[0]
     depth = ((center - position) * forward).sum(axis=1)
     if not near < np.median(depth) < far:
         center = (position + forward * (near + far) / 2).mean(axis=0)
         depth = ((center - position) * forward).sum(axis=1)
-    return Box(center, float(np.maximum(far - depth, depth - near).clip(min=0).max()))
-
-
-def pixel_footprint(views: Views, box: Box) -> float:
-    """Median size of a pixel at the box's center, world units: depth / focal length."""
-    position, forward = _optical_axes(views.cameras)
-    depth = ((box.center - position) * forward).sum(axis=1).clip(min=1e-6)
+    half_extent = float(np.maximum(far - depth, depth - near).clip(min=0).max())
     focal = (views.cameras.fx + views.cameras.fy)[:, 0].numpy() / 2
-    return float(np.median(depth / focal))
-
-
-def _optical_axes(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Position and viewing direction (a unit vector) of each camera, (n, 3) each."""
-    poses = cameras.camera_to_worlds.numpy()
-    return poses[:, :, 3], -poses[:, :, 2]
+    return Box(center, half_extent, float(np.median(depth.clip(min=1e-6) / focal)))
 
 
 def find_silhouettes(views: Views) -> dict[int, Silhouette]:
@@ -131,12 +122,8 @@ def _clip(values: np.ndarray, size: int) -> np.ndarray:
 
 
 def carve(views: Views, silhouettes: dict[int, Silhouette], box: Box, cell_size: float) -> Hull | None:
-    """The cells of a box that may hold something, None if there are none; without silhouettes, all that views see.
-
-    Args:
-        silhouettes: by the view's index.
-        cell_size: h.
-    """
+    """The cells, of that size, of a box that may hold something, None if there are none; without silhouettes (by the
+    view's index), all that views see."""
     levels = max(0, int(np.ceil(np.log2(2 * box.half_extent / (INITIAL_RESOLUTION * cell_size)))))
     aabb_min = box.center - cell_size * INITIAL_RESOLUTION * 2**levels / 2
     kept = _grid_indices(INITIAL_RESOLUTION)

@@ -12,16 +12,12 @@ import torch
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
-from edge_se_sampler.occupancy.hull import Box, Hull, Silhouette, carve, find_box, find_silhouettes, pixel_footprint
+from edge_se_sampler.occupancy.hull import Box, Hull, Silhouette, carve, find_box, find_silhouettes
 
 MAX_GRID_CELLS = 2**24
 """Cells of a grid's box, occupied or not: each takes memory."""
 MAX_MISSED_FRACTION = 0.01
 """Share of the foreground's pixels whose rays may miss a carved hull: stray ones do."""
-COARSENING = 1
-"""How often a carved hull's cells are doubled where training subdivides them."""
-ROUGH_RESOLUTION = 64
-"""Cells along the box of a first hull, by which the number of finer ones is estimated."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +25,6 @@ class SceneAnalysis:
     """What `analyze_scene` derives."""
 
     box: Box
-    pixel_footprint: float
-    """Size of a pixel at the box's center, world units."""
     num_silhouettes: int
     """Views whose alpha tells the object from the background; 0: nothing was carved."""
     hull: Hull
@@ -62,8 +56,7 @@ def analyze_scene(
     """
     max_uncarved = MAX_OCCUPIED_CELLS // 8 if prunable else MAX_OCCUPIED_CELLS
     box = find_box(views, near, far)
-    footprint = pixel_footprint(views, box)
-    cell_size = voxel_size_px * footprint
+    cell_size = voxel_size_px * box.pixel_footprint
     silhouettes = find_silhouettes(views) if by_alpha else {}
     hull = _bounded_hull(views, silhouettes, box, cell_size, MAX_OCCUPIED_CELLS if silhouettes else max_uncarved)
     if silhouettes and (hull is None or _missed_fraction(views, silhouettes, hull) > MAX_MISSED_FRACTION):
@@ -75,19 +68,19 @@ def analyze_scene(
             "no training view sees anything of what lies between --pipeline.model.near and far around "
             f"({', '.join(f'{x:.2f}' for x in box.center)}): check the cameras' poses and principal points"
         )
-    coarsening = COARSENING if prunable and silhouettes else 0
+    coarsening = 1 if prunable and silhouettes else 0
     max_level = coarsening
     if prunable and not silhouettes:
         wanted, possible = np.log2(hull.cell_size / cell_size), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3
         max_level = max(0, int(min(np.round(wanted), np.floor(possible))))
-    return SceneAnalysis(box, footprint, len(silhouettes), hull, coarsening, max_level)
+    return SceneAnalysis(box, len(silhouettes), hull, coarsening, max_level)
 
 
 def _bounded_hull(
     views: Views, silhouettes: dict[int, Silhouette], box: Box, cell_size: float, max_cells: int
 ) -> Hull | None:
     """The hull in cells of that size, or larger ones where there would be more than max_cells; None if it is empty."""
-    rough = carve(views, silhouettes, box, 2 * box.half_extent / ROUGH_RESOLUTION)
+    rough = carve(views, silhouettes, box, box.half_extent / 32)  # tells how many finer cells there would be
     if rough is None:
         return None
     volume = max(rough.cells.sum() / max_cells, rough.cells.size / MAX_GRID_CELLS) * rough.cell_size**3
