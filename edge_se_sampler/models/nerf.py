@@ -22,11 +22,11 @@ another (equally good) training run."""
 class NeRFModel(RayModel):
     """Coarse and fine networks, stratified and importance samples. `rng` draws the initial weights."""
 
-    config: NeRFModelConfig
     networks = ("coarse", "fine")
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None) -> None:
         super().__init__(config, grid)
+        self.config = config
         self.num_coarse_samples = config.preset.num_coarse_samples
         self.num_importance_samples = config.preset.num_importance_samples
         self.coarse = NeRFField(config, rng)
