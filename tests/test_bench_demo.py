@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench import demo
+from edge_se_sampler.bench.demo import train as demo
 
 
 def test_the_demo_leaves_a_picture_and_a_json_that_can_be_reported(

@@ -6,16 +6,20 @@ import json
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.nerfstudio.report import describe, tables
+from edge_se_sampler.bench.nerfstudio.report import describe
+from edge_se_sampler.bench.runner import VERSION
 
 
 def run(method: str, seed: int, psnr: float, outcome: str) -> dict[str, Any]:
-    return {"method": method, "seed": seed, "psnr": psnr, "outcome": outcome}
+    return {"method": method, "seed": seed, "psnr": psnr, "outcome": outcome, "cpu_seconds": 1.0}
 
 
 def write_result(folder: Path, **more: Any) -> None:
     result: dict[str, Any] = {
+        "version": VERSION,
+        "experiment": "nerfstudio",
         "command": "edge-se bench nerfstudio",
+        "errors": [],
         "settings": {"scene": "chair", "iterations": 10, "rays": 8, "samples": 4, "nerfstudio": "1.1.5"},
         "machine": {"processor": "p", "cores": 2, "threads": 1, "python": "3", "torch": "2", "numpy": "2"},
         "runs": [
@@ -30,9 +34,9 @@ def write_result(folder: Path, **more: Any) -> None:
 
 def test_failures_are_counted_by_method(tmp_path: Path) -> None:
     write_result(tmp_path)
-    failures = tables(tmp_path)["failures"]
-    assert "uniform pixels | 2 of 3 | 1 | 20.40 dB |" in failures
-    assert "Edge + SE | 0 of 1 | 0 | 25.00 dB |" in failures
+    readme = describe(tmp_path)
+    assert "uniform pixels | 2 of 3 | 1 | 20.40 dB |" in readme
+    assert "Edge + SE | 0 of 1 | 0 | 25.00 dB |" in readme
 
 
 def test_costs_are_ratios_to_uniform_pixels(tmp_path: Path) -> None:

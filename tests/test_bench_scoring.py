@@ -6,14 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.micro import command
+from edge_se_sampler.bench.micro import scoring
 
 
 def test_the_command_compares_the_three_error_sources(
     scene: Path, tmp_path: Path, edge_se: Any, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr("edge_se_sampler.bench.scenes.cached_scene", lambda *_: scene)
-    assert command.BenchScoring(output_dir=tmp_path).file_name == "scoring-small"
+    monkeypatch.setattr(scoring, "cached_scene", lambda *_: scene)
     flags = ["--scene", "mic", "--size", "tiny", "--rays", 64, "--rounds", 2, "--iterations", 12]
     answer = edge_se("bench", "scoring", "--output-dir", tmp_path / "new", *flags)
     assert answer.code == 0, answer

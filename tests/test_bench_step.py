@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from edge_se_sampler.bench.micro.step import measure_step
+from edge_se_sampler.bench.micro import step
 from edge_se_sampler.errors import InputError
 
 SLEEPER = """
@@ -33,13 +33,18 @@ def checkout(folder: Path, text: str) -> Path:
     return folder
 
 
-def test_both_programs_are_timed_as_often(scene: Path, tmp_path: Path) -> None:
-    result = measure_step(checkout(tmp_path / "sleeper", SLEEPER), scene, 3, "tiny", 8)
+@pytest.fixture(autouse=True)
+def small_scene(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(step, "cached_scene", lambda *_: scene)
+
+
+def test_both_programs_are_timed_as_often(tmp_path: Path) -> None:
+    result = step.measure(checkout(tmp_path / "sleeper", SLEEPER), tmp_path, 3, "tiny", 8)
     assert {name: len(seconds) for name, seconds in result["seconds"].items()} == {"nerf-pytorch": 3, "vanilla-nerf": 3}
     assert min(result["seconds"]["nerf-pytorch"]) >= 0.02
 
 
-def test_a_program_that_fails_is_named(scene: Path, tmp_path: Path) -> None:
+def test_a_program_that_fails_is_named(tmp_path: Path) -> None:
     broken = checkout(tmp_path / "broken", "render_path = None\ndef train():\n    raise OSError\n")
     with pytest.raises(InputError, match="nerf-pytorch does not train"):
-        measure_step(broken, scene, 1, "tiny", 8)
+        step.measure(broken, tmp_path, 1, "tiny", 8)

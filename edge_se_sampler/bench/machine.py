@@ -22,20 +22,11 @@ def machine() -> dict[str, Any]:
         "torch": torch.__version__,
         "numpy": numpy.__version__,
         "platform": platform.platform(),
-        "processor": _processor(),
+        "processor": _read_proc("cpuinfo", "model name") or platform.processor(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
-        return names[0]
-    except (OSError, IndexError):
-        return platform.processor()
 
 
 def resident_memory(what: str = "VmRSS") -> int:
@@ -43,7 +34,14 @@ def resident_memory(what: str = "VmRSS") -> int:
 
     From /proc: getrusage's maximum counts the parent's memory before exec. Elsewhere than Linux it has to do.
     """
-    with contextlib.suppress(OSError), open("/proc/self/status") as file:
-        return next(1024 * int(line.split()[1]) for line in file if line.startswith(what))
+    if kilobytes := _read_proc("self/status", what):
+        return 1024 * int(kilobytes.split()[0])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if platform.system() == "Darwin" else peak * 1024
+
+
+def _read_proc(file: str, key: str) -> str | None:
+    """The value of the first line `key: value` in a file of /proc; None where there is none."""
+    with contextlib.suppress(OSError, StopIteration), open(f"/proc/{file}") as lines:
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith(key))
+    return None

@@ -8,43 +8,32 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from string import Formatter
-from typing import Any, Protocol
+from typing import Any
 
 from edge_se_sampler.bench.tables import fill_markers
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 
-REPORTS = {name: f"{name}.report" for name in ("chart", "paper", "stability", "schedule", "nerfstudio", "micro")}
-REPORTS["demo"] = "demo"
-"""Experiment -> the module of `edge_se_sampler.bench` that reports it."""
+REPORTS = ("chart", "paper", "stability", "schedule", "nerfstudio", "micro", "demo")
+"""Experiments, each a package with a module `report`."""
 
 
-class Report(Protocol):
-    """What such a module has; and `tables(folder)`, tables by name, if other texts show some between markers."""
-
-    def describe(self, folder: Path) -> str:
-        """The README.md of a folder of results; a function of the json files and of which pictures there are."""
-        ...
-
-    def draw(self, folder: Path, workplace: Path | None) -> None:
-        """Draw the folder's pictures; those that need renderings only where the workplace has them."""
-        ...
-
-
-def report_of(folder: Path) -> Report:
-    """The module that reports a folder.
+def report_of(folder: Path) -> Any:
+    """The module that reports a folder: `describe(folder)` is its README.md, a function of the json files and of which
+    pictures there are. Optional: `draw(folder, workplace)` draws the pictures, those that need renderings only where
+    the workplace has them; `tables(folder)` are tables by name that other texts show.
 
     Raises:
         InputError: no result lies there.
     """
     for path in sorted(folder.glob("**/*.json")):
         with suppress(OSError, ValueError, TypeError, KeyError):
-            name = REPORTS[json.loads(path.read_text(encoding="utf-8"))["experiment"]]
-            break
+            name = json.loads(path.read_text(encoding="utf-8"))["experiment"]
+            if name in REPORTS:
+                break
     else:
         raise InputError(f"{folder}: no result of edge-se bench lies there")
-    module: Any = import_module(f"edge_se_sampler.bench.{name}")
-    return module
+    return import_module(f"edge_se_sampler.bench.{name}.report")
 
 
 def write_report(folder: Path, readme: Path | None = None, workplace: Path | None = None) -> None:
@@ -58,11 +47,11 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
         InputError: no result lies there, matplotlib is missing, or a file cannot be written.
     """
     report = report_of(folder)
-    report.draw(folder, workplace)
+    if hasattr(report, "draw"):
+        report.draw(folder, workplace)
     write_atomically(folder / "README.md", report.describe(folder).encode())
     if readme is not None:
-        tables = getattr(report, "tables", None)
-        fill_markers(readme, tables(folder) if tables else {})
+        fill_markers(readme, report.tables(folder) if hasattr(report, "tables") else {})
 
 
 def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:
@@ -83,5 +72,5 @@ def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:
 
 
 def _is_empty(section: str, parts: dict[str, object]) -> bool:
-    names = [name for _, name, _, _ in Formatter().parse(section) if name]
+    names = [re.split(r"[.[]", name)[0] for _, name, _, _ in Formatter().parse(section) if name]
     return bool(names) and all(parts.get(name, "") == "" for name in names)

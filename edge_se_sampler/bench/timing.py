@@ -29,6 +29,6 @@ def time_interleaved(
     return {name: values[warmup:] for name, values in seconds.items()}
 
 
-def medians(seconds: Mapping[str, list[float]]) -> dict[str, float]:
-    """The median of every case."""
-    return {name: statistics.median(values) for name, values in seconds.items()}
+def median_milliseconds(cases: Mapping[str, Callable[[int], Any]], rounds: int) -> dict[str, float]:
+    """The median of every case over the rounds of `time_interleaved`."""
+    return {name: 1e3 * statistics.median(seconds) for name, seconds in time_interleaved(cases, rounds).items()}

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import check_value
 
 
 @dataclass(frozen=True, kw_only=True)
-class MicroBenchmark(ABC):
-    """Measures, writes OUTPUT_DIR/NAME.json, and OUTPUT_DIR/README.md of all benchmarks whose json lies there."""
+class MicroBenchmark:
+    """Measures, writes a json into OUTPUT_DIR, and OUTPUT_DIR/README.md of all benchmarks whose json lies there."""
 
     name: ClassVar[str]
-    """As in `edge-se bench NAME`."""
+    """As in `edge-se bench NAME`; `measure` of the module of that name takes all other flags."""
+    file_name: ClassVar[str]
 
     output_dir: Path
     """Where the json and README.md go; a json of an earlier call is replaced."""
@@ -26,29 +27,20 @@ class MicroBenchmark(ABC):
         Raises:
             InputError: a flag's value has no meaning, or a file cannot be written.
         """
-        from edge_se_sampler.bench.micro.report import SECTIONS
         from edge_se_sampler.bench.report import write_report
         from edge_se_sampler.bench.runner import new_result
         from edge_se_sampler.engine.files import make_folder, write_json
 
-        settings = {key: value for key, value in asdict(self).items() if not isinstance(value, Path)}
+        flags = {key: value for key, value in asdict(self).items() if key != "output_dir"}
+        settings = {key: value for key, value in flags.items() if not isinstance(value, Path)}
         for key, value in settings.items():
-            if isinstance(value, int) and value < 1:
-                raise InputError(f"--{key} is {value}: must be at least 1")
+            check_value(key, value, not isinstance(value, int) or value >= 1, "at least 1")
         make_folder(self.output_dir, "--output-dir")
-        result = {**new_result("micro", settings), "benchmark": self.name, **self.measure()}
-        write_json(self.output_dir / f"{self.file_name}.json", result)
+        measured = import_module(f"edge_se_sampler.bench.micro.{self.name}").measure(**flags)
+        result = {**new_result("micro", settings), "benchmark": self.name, **measured}
+        write_json(self.output_dir / self.file_name.format(**settings), result)
         write_report(self.output_dir)
-        print(SECTIONS[self.name](result))
-
-    @property
-    def file_name(self) -> str:
-        """Of the json, without its suffix."""
-        return self.name
-
-    @abstractmethod
-    def measure(self) -> dict[str, Any]:
-        """What was measured."""
+        print((self.output_dir / "README.md").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +48,7 @@ class BenchSamplers(MicroBenchmark):
     """Time building probability tables, drawing and selecting pixels; compare training memory of SE with Random's."""
 
     name: ClassVar[str] = "samplers"
+    file_name: ClassVar[str] = "samplers.json"
     images: int = 100
     """Images in the tables."""
     size: int = 800
@@ -65,11 +58,6 @@ class BenchSamplers(MicroBenchmark):
     rounds: int = 200
     """Timed draws of each kind; medians are reported."""
 
-    def measure(self) -> dict[str, Any]:
-        from edge_se_sampler.bench.micro.samplers import measure_samplers
-
-        return measure_samplers(self.images, self.size, self.draws, self.rounds)
-
 
 @dataclass(frozen=True, kw_only=True)
 class BenchScoring(MicroBenchmark):
@@ -77,6 +65,7 @@ class BenchScoring(MicroBenchmark):
     against Random's; and how well the cheap ones rank pixels."""
 
     name: ClassVar[str] = "scoring"
+    file_name: ClassVar[str] = "scoring-{size}.json"
     workplace: Path = Path("bench")
     """Where the scene is kept."""
     scene: str = "bricks"
@@ -90,17 +79,6 @@ class BenchScoring(MicroBenchmark):
     iterations: int = 300
     """Of training before rankings are compared."""
 
-    @property
-    def file_name(self) -> str:
-        return f"scoring-{self.size}"
-
-    def measure(self) -> dict[str, Any]:
-        from edge_se_sampler.bench.micro.scoring import measure_scoring
-        from edge_se_sampler.bench.scenes import cached_scene
-
-        scene = cached_scene(self.workplace, self.scene)
-        return measure_scoring(scene, self.size, self.rays, self.rounds, self.iterations)
-
 
 @dataclass(frozen=True, kw_only=True)
 class BenchStep(MicroBenchmark):
@@ -108,15 +86,10 @@ class BenchStep(MicroBenchmark):
     turns. Leave the machine alone meanwhile."""
 
     name: ClassVar[str] = "step"
+    file_name: ClassVar[str] = "step.json"
     checkout: Path
     """A git checkout of github.com/yenchenlin/nerf-pytorch."""
     workplace: Path = Path("bench")
     """Where the scene is kept."""
     rounds: int = 8
     """Timed steps of each; medians are reported."""
-
-    def measure(self) -> dict[str, Any]:
-        from edge_se_sampler.bench.micro.step import measure_step
-        from edge_se_sampler.bench.scenes import cached_scene
-
-        return measure_step(self.checkout, cached_scene(self.workplace, "bricks"), self.rounds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.bench.runner import run_in_subprocess
-from edge_se_sampler.bench.timing import medians, time_interleaved
+from edge_se_sampler.bench.timing import median_milliseconds
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.pipeline import Pipeline
@@ -29,18 +30,12 @@ EPSILON = np.float32(0.01)
 MEMORY_RAYS = 1024
 
 
-def measure_samplers(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
-    """Build tables of noise images and time draws from them.
-
-    Args:
-        images: how many.
-        size: rows and columns of each.
-        draws: pixels per draw.
-        rounds: timed draws of each kind.
+def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
+    """Build tables of noise images, size x size pixels each, and time draws from them.
 
     Returns:
-        `tables` (`build_tables`), `milliseconds` of each kind of draw, and `training_memory`, the bytes that training
-        at random and by squared error holds at its peak.
+        `tables` (`build_tables`), median `milliseconds` of each kind of draw, and `training_memory`, the bytes that
+        training at random and by squared error holds at its peak.
     """
     table, tables = build_tables(images, size)
     every_image, one_image = torch.arange(images), torch.tensor([images // 2])
@@ -48,42 +43,36 @@ def measure_samplers(images: int, size: int, draws: int, rounds: int) -> dict[st
     flat_cdf = torch.cumsum(torch.rand(images * size * size, dtype=torch.float64), dim=0)
     errors = torch.rand(2 * draws)
     extent = torch.tensor([images, size, size])
-    seconds = time_interleaved(
-        {
-            "edge_all_images": lambda step: table.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
-            "edge_one_image": lambda step: table.draw(one_image, draws, stream(0, step, Stream.PIXELS)),
-            "uniform_all_images": lambda step: uniform.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
-            "flat_searchsorted": lambda _: torch.searchsorted(
-                flat_cdf, torch.rand(draws, dtype=torch.float64) * flat_cdf[-1]
-            ),
-            "se_selection": lambda step: sample_by_rank(errors, draws, stream(0, step, Stream.SELECTION)),
-            # what PixelSampler.sample_method of nerfstudio 1.1.5 computes without a mask
-            "nerfstudio_uniform": lambda _: (torch.rand((draws, 3)) * extent).long(),
-        },
-        rounds,
-    )
-    random_bytes, se_bytes = (training_peak(method, MEMORY_RAYS, "small") for method in ("vanilla-nerf", "se-nerf"))
-    return {
-        "tables": tables,
-        "milliseconds": {name: 1e3 * value for name, value in medians(seconds).items()},
-        "training_memory": {"rays": MEMORY_RAYS, "random_bytes": random_bytes, "se_bytes": se_bytes},
+    cases: dict[str, Callable[[int], Any]] = {
+        "edge_all_images": lambda step: table.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
+        "edge_one_image": lambda step: table.draw(one_image, draws, stream(0, step, Stream.PIXELS)),
+        "uniform_all_images": lambda step: uniform.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
+        "flat_searchsorted": lambda _: torch.searchsorted(
+            flat_cdf, torch.rand(draws, dtype=torch.float64) * flat_cdf[-1]
+        ),
+        "se_selection": lambda step: sample_by_rank(errors, draws, stream(0, step, Stream.SELECTION)),
+        # what PixelSampler.sample_method of nerfstudio 1.1.5 computes without a mask
+        "nerfstudio_uniform": lambda _: (torch.rand((draws, 3)) * extent).long(),
     }
+    milliseconds = median_milliseconds(cases, rounds)
+    random_bytes, se_bytes = (training_peak(method, MEMORY_RAYS, "small") for method in ("vanilla-nerf", "se-nerf"))
+    memory = {"rays": MEMORY_RAYS, "random_bytes": random_bytes, "se_bytes": se_bytes}
+    return {"tables": tables, "milliseconds": milliseconds, "training_memory": memory}
 
 
 def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:
     """Edge tables of noise images (eight different ones, repeated), and what building them took."""
     noise = [np.random.default_rng(i).integers(0, 256, (size, size, 4), dtype=np.uint8) for i in range(min(images, 8))]
-    progress = Progress(images, "building tables")
     table = PixelTable()
     memory_before, start = resident_memory(), time.perf_counter()
+    with Progress(images, "building tables") as progress:
 
-    def strength(i: int) -> torch.Tensor:
-        progress.update(i + 1)
-        return torch.from_numpy(edge_strength(noise[i % len(noise)]) + EPSILON)
+        def measure_edges(i: int) -> torch.Tensor:
+            progress.update(i + 1)
+            return torch.from_numpy(edge_strength(noise[i % len(noise)]) + EPSILON)
 
-    table.add(in_threads(strength, range(images)))
+        table.add(in_threads(measure_edges, range(images)))
     seconds = time.perf_counter() - start
-    progress.close()
     pixels = images * size * size
     return table, {
         "build_seconds": seconds,
@@ -95,22 +84,18 @@ def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:
 def training_peak(method: str, rays: int, size: str, error_source: str = "fine") -> int:
     """Resident bytes, above the level after imports, of a few training steps of the late phase in a fresh process.
 
-    Args:
-        rays: pixels per step.
-        size: of the networks, as `--pipeline.model.size`.
-        error_source: of squared errors, where the method samples by them.
+    Args: as `late_phase`.
     """
-    return run_in_subprocess(_training_peak, method, rays, size, error_source)
+    return run_in_subprocess(_training_peak, method, late_phase(rays, size, error_source))
 
 
-def _training_peak(method: str, rays: int, size: str, error_source: str) -> int:
+def _training_peak(method: str, changes: dict[str, Any]) -> int:
     noise = np.random.default_rng(0).integers(0, 256, (8, 100, 100, 3), dtype=np.uint8)
     pose = np.eye(4)
     pose[2, 3] = 4
     cameras = Cameras.of([pose] * 8, fx=100, fy=100, cx=50, cy=50, width=100, height=100)
     views = Views(tuple("abcdefgh"), tuple(noise), None, cameras)
-    config = override(method_configs()[method], late_phase(rays, size, error_source))
-    config = resolve_config(config, views)
+    config = resolve_config(override(method_configs()[method], changes), views)
     before = resident_memory()
     pipeline = Pipeline.build(config, views, "cpu")
     trainer = config.setup(run=RunFolder(Path("never-written")), pipeline=pipeline, preview=None)
@@ -120,7 +105,13 @@ def _training_peak(method: str, rays: int, size: str, error_source: str) -> int:
 
 
 def late_phase(rays: int, size: str, error_source: str) -> dict[str, Any]:
-    """Changes of a config (`override`): no early phase, so many rays per step, networks of a size."""
+    """Changes of a config (`override`): no early phase.
+
+    Args:
+        rays: pixels per step.
+        size: of the networks, as `--pipeline.model.size`.
+        error_source: of squared errors, where the method samples by them.
+    """
     return {
         f"{SAMPLER}.early_fraction": 0.0,
         f"{SAMPLER}.error_source": error_source,

@@ -15,9 +15,11 @@ import torch
 
 from edge_se_sampler.bench.micro.samplers import late_phase, training_peak
 from edge_se_sampler.bench.overrides import override
+from edge_se_sampler.bench.scenes import cached_scene
 from edge_se_sampler.bench.statistics import require_scipy_stats
-from edge_se_sampler.bench.timing import medians, time_interleaved
+from edge_se_sampler.bench.timing import median_milliseconds
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
@@ -28,8 +30,8 @@ NUM_RANKED = 4096
 """Pixels whose scores are ranked."""
 
 
-def measure_scoring(data: Path, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
-    """Measure on a Blender folder.
+def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
+    """Measure on a synthetic scene.
 
     Args:
         size: of the networks, as `--pipeline.model.size`.
@@ -38,36 +40,32 @@ def measure_scoring(data: Path, size: str, rays: int, rounds: int, iterations: i
         iterations: of training before rankings are compared.
 
     Returns:
-        `milliseconds` per step of Random and of each error source, `memory_against_random` of each error source (a
-        ratio of peaks), and `rank_correlation` of the cheap scores with the fine ones (Spearman).
+        median `milliseconds` per step of Random and of each error source, `memory_against_random` of each error source
+        (a ratio of peaks), and `rank_correlation` of the cheap scores with the fine ones (Spearman).
 
     Raises:
-        InputError: the folder is no scene, or the [bench] extra is missing.
+        InputError: no such scene, or the [bench] extra is missing.
     """
     require_scipy_stats()
+    data = cached_scene(workplace, scene)
     methods = {"random": ("vanilla-nerf", "fine"), **{source: ("se-nerf", source) for source in ERROR_SOURCES}}
     with tempfile.TemporaryDirectory() as folder:
+        base = {"data": data, "output_dir": Path(folder), "machine.device_type": "cpu"}
 
         def build_trainer(method: str, error_source: str) -> Trainer:
-            config = method_configs()[method]
-            changes = {"data": data, "output_dir": Path(folder), "machine.device_type": "cpu"}
-            return prepare(override(config, changes | late_phase(rays, size, error_source)))
+            return prepare(override(method_configs()[method], base | late_phase(rays, size, error_source)))
 
         trainers = {name: build_trainer(*method) for name, method in methods.items()}
-        seconds = time_interleaved({name: trainer.train_iteration for name, trainer in trainers.items()}, rounds)
+        milliseconds = median_milliseconds({name: each.train_iteration for name, each in trainers.items()}, rounds)
         trainer = build_trainer("se-nerf", "cached")
-        progress = Progress(iterations, "training")
-        for step in range(iterations):
-            trainer.train_iteration(step)
-            progress.update(step + 1)
-        progress.close()
+        with Progress(iterations, "training") as progress:
+            for step in range(iterations):
+                trainer.train_iteration(step)
+                progress.update(step + 1)
         correlations = correlate_rankings(trainer, iterations)
     peaks = {name: training_peak(method, rays, size, source) for name, (method, source) in methods.items()}
-    return {
-        "milliseconds": {name: 1e3 * value for name, value in medians(seconds).items()},
-        "memory_against_random": {source: peaks[source] / peaks["random"] for source in ERROR_SOURCES},
-        "rank_correlation": correlations,
-    }
+    memory = {source: peaks[source] / peaks["random"] for source in ERROR_SOURCES}
+    return {"milliseconds": milliseconds, "memory_against_random": memory, "rank_correlation": correlations}
 
 
 def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
@@ -88,14 +86,8 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
     indices = torch.tensor(pixels)
     rays = manager.cameras.pixel_rays(indices)
     image = torch.stack([images[n][row, column] for n, row, column in pixels]).float() / 255
-    errors: dict[str, list[torch.Tensor]] = {"fine": [], "coarse": []}
-    model.eval()
-    with torch.no_grad():
-        for rows in model.chunks(len(rays)):
-            outputs = model(rays[rows])
-            for level, of_level in errors.items():
-                of_level.append(model.squared_error(outputs, image[rows], level))
-    fine, coarse = (torch.cat(of_level).numpy() for of_level in errors.values())
+    outputs = render_outputs(model, rays, ("background", "rgb_fine", "rgb_coarse"))
+    fine, coarse = (model.squared_error(outputs, image, network).numpy() for network in ("fine", "coarse"))
     cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)
     spearman = require_scipy_stats().spearmanr
     return {"coarse": float(spearman(fine, coarse).statistic), "cached": float(spearman(fine, cached).statistic)}

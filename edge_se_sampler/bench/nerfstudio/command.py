@@ -9,8 +9,6 @@ from edge_se_sampler.bench.command import ExperimentCommand
 from edge_se_sampler.errors import InputError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from edge_se_sampler.bench.runner import Experiment
 
 
@@ -19,33 +17,25 @@ class BenchNerfstudio(ExperimentCommand):
     """Count failed trainings inside nerfstudio, with its own pixel sampler and with Edge + SE, and measure what a step
     costs. Needs nerfstudio 1.1.5 in the same environment. Resumes."""
 
-    scene: str = "chair"
-    """One of edge-se scenes."""
     seeds: tuple[int, ...] = tuple(range(10))
     """Of weights, pixels and jitter."""
-    iterations: int = 1500
-    """Of every training."""
-    rays: int = 32
-    """Pixels per step."""
-    samples: int = 16
-    """Coarse samples per ray, and as many importance samples."""
 
     def experiment(self) -> Experiment:
         from importlib.metadata import version
         from importlib.util import find_spec
 
-        from edge_se_sampler.bench.nerfstudio.train import METHODS, TrainingSettings, Trial, run_trial
+        from edge_se_sampler.bench.nerfstudio.train import METHODS, TrainingSettings, Trial, render_scene, run_trial
         from edge_se_sampler.bench.runner import Experiment
 
         if find_spec("nerfstudio") is None or find_spec("torchvision") is None:
             raise InputError("bench nerfstudio needs all of nerfstudio 1.1.5 beside edge_se_sampler in one environment")
-        if min(self.iterations, self.rays, self.samples) < 1:
-            raise InputError("--iterations, --rays and --samples must be at least 1")
-        settings = TrainingSettings(self.scene, self.iterations, self.rays, self.samples, version("nerfstudio"))
+        settings = TrainingSettings(nerfstudio=version("nerfstudio"))
         trials = [Trial(method, seed) for seed in self.seeds for method in METHODS]
-        return Experiment(
-            "nerfstudio", settings, lambda _: trials, run_trial, lambda _: (settings, self._data(), self.workplace)
-        )
+
+        def arguments(_: Trial) -> tuple[object, ...]:
+            return settings, render_scene(self.workplace), self.workplace
+
+        return Experiment("nerfstudio", settings, lambda _: trials, run_trial, arguments)
 
     def run(self) -> None:
         """Train, measure costs unless the result has them, and report.
@@ -53,23 +43,16 @@ class BenchNerfstudio(ExperimentCommand):
         Raises:
             InputError: as the base class.
         """
-        from edge_se_sampler.bench.nerfstudio.train import measure_costs
+        from edge_se_sampler.bench.nerfstudio.train import measure_costs, render_scene
         from edge_se_sampler.bench.report import write_report
         from edge_se_sampler.bench.runner import read_result, write_result
 
         super().run()
         path = self.output_dir / "result.json"
         if not self.dry_run and "costs" not in (result := read_result(path)):
-            write_result(path, result | {"costs": measure_costs(self._data(), self.workplace)})
+            write_result(path, result | {"costs": measure_costs(render_scene(self.workplace), self.workplace)})
             write_report(self.output_dir, workplace=self.workplace)
 
     def default_workers(self) -> int:
         """One: a training uses as many threads as torch takes."""
         return 1
-
-    def _data(self) -> Path:
-        """The scene's folder."""
-        from edge_se_sampler.bench.nerfstudio.train import SCENE_OPTIONS
-        from edge_se_sampler.bench.scenes import cached_scene
-
-        return cached_scene(self.workplace, self.scene, **SCENE_OPTIONS)

@@ -13,6 +13,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import run_in_subprocess
+from edge_se_sampler.bench.scenes import cached_scene
 from edge_se_sampler.bench.timing import time_interleaved
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
@@ -38,14 +40,14 @@ COST_RAYS, COST_STEPS, COST_ROUNDS = 256, 8, 3
 class TrainingSettings:
     """What is trained, by which nerfstudio."""
 
-    scene: str
-    iterations: int
-    rays: int
-    """Pixels per step."""
-    samples: int
-    """Coarse samples per ray, and as many importance samples."""
     nerfstudio: str
     """Its version."""
+    scene: str = "chair"
+    iterations: int = 1500
+    rays: int = 32
+    """Pixels per step."""
+    samples: int = 16
+    """Coarse samples per ray, and as many importance samples."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,11 @@ class Trial:
         return f"{self.method}, seed {self.seed}"
 
 
+def render_scene(workplace: Path) -> Path:
+    """The scene's Blender folder, kept in the workplace."""
+    return cached_scene(workplace, TrainingSettings.scene, **SCENE_OPTIONS)
+
+
 def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: Path) -> dict[str, Any]:
     """Train once and measure the test views: seconds, cpu_seconds, psnr, and those of `measure_outcome`."""
     config = build_config(trial.method, trial.seed, data, workplace / "runs", [RAYS, str(settings.rays)])
@@ -74,13 +81,9 @@ def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: P
         views = render_test_views(trainer)
     pictures = to_pictures(read_blender(data, "test"))
     images = [compute_metrics(view, picture.image, 1.0) for view, picture in zip(views, pictures, strict=True)]
-    results = {"psnr": statistics.mean(image["psnr"] or 0.0 for image in images), "images": images}
-    return {
-        "seconds": seconds,
-        "cpu_seconds": cpu_seconds,
-        "psnr": results["psnr"],
-        **measure_outcome(results, pictures, 1.0),
-    }
+    psnr = statistics.mean(image["psnr"] or 0.0 for image in images)
+    outcome = measure_outcome({"psnr": psnr, "images": images}, pictures, 1.0)
+    return {"seconds": seconds, "cpu_seconds": cpu_seconds, "psnr": psnr, **outcome}
 
 
 def measure_costs(data: Path, workplace: Path) -> dict[str, Any]:
@@ -90,11 +93,9 @@ def measure_costs(data: Path, workplace: Path) -> dict[str, Any]:
         `rays` per step and `medians`: "METHOD uniform|se" -> seconds per step, and peak resident bytes above the level
         after set-up, in fresh processes that take turns.
     """
-    cases = [(method, late) for method in COST_METHODS for late in ("uniform", "se")]
     costs: dict[str, list[dict[str, float]]] = defaultdict(list)
-    for _ in range(COST_ROUNDS):
-        for method, late in cases:
-            costs[f"{method} {late}"].append(run_in_subprocess(_measure_step, method, late, data, workplace))
+    for _, method, late in product(range(COST_ROUNDS), COST_METHODS, ("uniform", "se")):
+        costs[f"{method} {late}"].append(run_in_subprocess(_measure_step, method, late, data, workplace))
     medians = {
         case: {key: statistics.median(cost[key] for cost in repeated) for key in ("seconds", "bytes")}
         for case, repeated in costs.items()
@@ -122,10 +123,6 @@ def _measure_step(method: str, late: str, data: Path, workplace: Path) -> dict[s
 @contextlib.contextmanager
 def _silent(workplace: Path) -> Iterator[None]:
     """What nerfstudio prints goes to a log in the workplace; its warnings go nowhere."""
-    with (
-        open(workplace / "nerfstudio.log", "a") as log,
-        contextlib.redirect_stdout(log),
-        warnings.catch_warnings(),
-    ):
+    with open(workplace / "nerfstudio.log", "a") as log, contextlib.redirect_stdout(log), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
