@@ -100,7 +100,7 @@ def _draw(
     path: Path, methods: dict[str, dict[str, Any]], views: dict[str, np.ndarray], target: np.ndarray, background: float
 ) -> None:
     """A test view and its renderings; below, the PSNR of a validation view over steps and seconds of training."""
-    layout = [[name for name in ("truth", *METHODS) for _ in range(2)], ["step"] * 3 + ["seconds"] * 3]
+    layout: Any = [[name for name in ("truth", *METHODS) for _ in range(2)], ["step"] * 3 + ["seconds"] * 3]
     figure, axes = require_pyplot().subplot_mosaic(layout, figsize=(10.5, 7.0), layout="constrained")
     titles = {method: f"{label}: {methods[method]['results']['psnr']:.2f} dB" for method, label in METHODS.items()}
     for name, title in {"truth": "ground truth", **titles}.items():

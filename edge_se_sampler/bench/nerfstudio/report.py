@@ -9,7 +9,7 @@ from typing import Any
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.bench.tables import describe_command, markdown_table
+from edge_se_sampler.bench.tables import describe_machine, markdown_table
 
 LABELS = {"vanilla-nerf": "`vanilla-nerf`: nerfstudio's uniform pixels", "edge-se-nerf": "`edge-se-nerf`: Edge + SE"}
 
@@ -22,9 +22,10 @@ def describe(folder: Path) -> str:
     """
     result = read_result(folder / "result.json")
     parts = {"failures": _tabulate_failures(result["runs"]), "failure_rule": FAILURE_RULE}
+    parts |= {"command": result["command"], "machine": describe_machine(result["machine"])}
     if "costs" in result:
         parts |= {"cost_rays": result["costs"]["rays"], "costs": _tabulate_costs(result["costs"]["medians"])}
-    return fill_template(__file__, folder, **result["settings"], **parts, reproduce=describe_command(result))
+    return fill_template(__file__, folder, **result["settings"], **parts)
 
 
 def _tabulate_failures(runs: list[Run]) -> str:
