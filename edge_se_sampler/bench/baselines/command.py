@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
 from edge_se_sampler.bench.chart.command import ChartOptions
+from edge_se_sampler.errors import InputError
 
 ProgramName = Literal["nerf-pytorch", "tensorf", "nerfstudio-vanilla-nerf", "nerfstudio-nerfacto"]
 
@@ -28,8 +30,14 @@ class BenchBaselines(ChartOptions):
     """What distinguishes these flags from others, in pictures and tables."""
 
     def run(self) -> None:
+        """Train one after the other; what has ended is kept.
+
+        Raises:
+            InputError: the program is not there, refuses its flags or ends too soon, or the json is of other settings.
+        """
         from edge_se_sampler.bench.baselines.results import BaselineSettings, path_of
-        from edge_se_sampler.bench.baselines.run import run_baseline, version_of
+        from edge_se_sampler.bench.baselines.run import Task, Trial, train, version_of
+        from edge_se_sampler.bench.runner import load_or_create, pending, run_in_subprocess, write_result
         from edge_se_sampler.engine.files import check_output, make_folder
 
         settings = BaselineSettings(
@@ -39,7 +47,16 @@ class BenchBaselines(ChartOptions):
         path = path_of(settings, self.output_dir)
         make_folder(path.parent, "--output-dir")
         check_output(path, "--output-dir")
-        scenes = {scene: self.scene_folder(scene).resolve() for scene in self.scenes}
-        for run in run_baseline(settings, self.checkout, scenes, self.seeds, path):
+        result = load_or_create(path, "baselines", settings)
+        trials = [Trial(scene, seed) for seed, scene in product(self.seeds, self.scenes)]
+        for trial in pending(trials, result):
+            task = Task(settings, self.checkout, self.scene_folder(trial.scene).resolve(), trial.seed)
+            try:
+                run = run_in_subprocess(train, task)
+            except RuntimeError as problem:
+                raise InputError(f"{settings.name} on {trial.scene}, seed {trial.seed}: {problem}") from None
+            result["runs"].append({**asdict(trial), **run})
+            write_result(path, result)
+        for run in result["runs"]:
             seconds, psnr = run["curve"][-1]
             print(f"{settings.name}, {run['scene']}, {run['seed']}: {psnr:.2f} dB after {seconds:.0f} s")

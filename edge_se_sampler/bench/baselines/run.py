@@ -19,10 +19,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ import torch
 
 from edge_se_sampler.bench.baselines.results import BaselineSettings
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
-from edge_se_sampler.bench.runner import Run, load_or_create, pending, run_in_subprocess, write_result
+from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
@@ -97,31 +96,12 @@ class Task:
     seed: int
 
 
-def run_baseline(
-    settings: BaselineSettings, checkout: Path | None, scenes: Mapping[str, Path], seeds: Sequence[int], path: Path
-) -> list[Run]:
-    """Train another program on scenes (name -> Blender folder) with seeds, one after the other.
-
-    Args:
-        path: of the json; runs that it already has are kept.
+def train(task: Task) -> Run:
+    """Steps and curve of a training; to be called in a fresh process, because programs change what is global.
 
     Raises:
-        InputError: the program is not there, refuses its flags or ends too soon, or the json is of other settings.
+        InputError: the program is not there, refuses its flags or ends too soon.
     """
-    trials = [Trial(scene, seed) for seed, scene in product(seeds, scenes)]
-    result = load_or_create(path, "baselines", settings)
-    for trial in pending(trials, result):
-        try:
-            run = run_in_subprocess(train, Task(settings, checkout, scenes[trial.scene], trial.seed))
-        except RuntimeError as problem:
-            raise InputError(f"{settings.name} on {trial.scene}, seed {trial.seed}: {problem}") from None
-        result["runs"].append({**asdict(trial), **run})
-        write_result(path, result)
-    return result["runs"]
-
-
-def train(task: Task) -> Run:
-    """Steps and curve of a training; in a fresh process, because programs change what is global."""
     settings = task.settings
     torch.set_num_threads(settings.threads)
     clock = Clock(settings)
