@@ -181,11 +181,19 @@ def test_who_is_better_at_every_evaluation_is_found() -> None:
         assert always_better([lean, edge]) == expected
 
 
-def test_differences_are_of_common_seeds_scene_by_scene() -> None:
-    runs = [run_of("lean", "mic", 0, [(1, 20)]), run_of("lean", "mic", 1, [(1, 99)])]
+def test_differences_are_those_of_each_scene() -> None:
+    lean = [run_of("lean", "mic", 0, [(1, 20)]), run_of("lean", "chair", 0, [(1, 30), (9, 31)])]
+    edge = [run_of("edge", "mic", 0, [(1, 15)]), run_of("edge", "chair", 0, [(5, 28)])]
+    assert differences(lean, edge, END) == {"chair": 3, "mic": 5}
+    assert differences(lean, edge, 1) == {"mic": 5}  # chair has not been evaluated yet
+
+
+def test_pairs_of_variants_are_compared_on_common_scenes_and_seeds(tmp_path: Path) -> None:
+    runs = [run_of("edge-se", "mic", 0, [(1, 20)]), run_of("edge-se", "mic", 1, [(1, 99)])]
     runs += [run_of("edge", "mic", 0, [(1, 15)]), run_of("edge", "chair", 0, [(1, 1)])]
-    assert differences(runs, "lean", "edge", 3) == {"mic": 5}
-    assert differences(runs, "lean", "se", 3) == {}
+    text = describe(folder_of(tmp_path, runs))
+    assert row_of(text, "squared errors on the original NeRF") == ["Edge + SE − Edge", "mic", "1", "+5.00"]
+    assert "caching them" not in text
 
 
 def test_only_common_scenes_and_seeds_are_compared() -> None:

@@ -116,13 +116,15 @@ def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool 
 def _compare_pairs(runs: list[Run]) -> str:
     """The pairs of variants that tell what one thing is worth, over all scenes that both were trained on."""
     moments = [seconds for seconds in moments_of(runs) if seconds in COLUMNS]
-    rows = []
+    trained, rows = by_variant(runs), []
     for (first, second), what in COMPARISONS.items():
-        ahead = [differences(runs, first, second, seconds) for seconds in moments]
-        if ahead[-1]:
+        compared = comparable({name: trained.get(name, []) for name in (first, second)})
+        if compared:
+            ahead = [differences(compared[first], compared[second], seconds) for seconds in moments]
             pair = f"{VARIANTS[first].full_label} − {VARIANTS[second].full_label}"
-            rows.append([what, pair, ", ".join(ahead[-1]), *map(_describe_difference, ahead)])
-    head = ["what", "difference", "scenes", *(COLUMNS[seconds] for seconds in moments)]
+            pairs = str(len(compared[first]))
+            rows.append([what, pair, ", ".join(ahead[-1]), pairs, *map(_describe_difference, ahead)])
+    head = ["what", "difference", "scenes", "pairs of trainings", *(COLUMNS[seconds] for seconds in moments)]
     return markdown_table(head, rows) if rows else ""
 
 

@@ -87,12 +87,11 @@ def always_better(runs: list[Run]) -> list[str]:
     return [name for name in (rows[-1] if rows else ()) if all(row.get(name, END) > row[RECOMMENDED] for row in rows)]
 
 
-def differences(runs: list[Run], first: str, second: str, seconds: float) -> dict[str, float]:
-    """Scene -> by how many dB the first variant is ahead of the second at a moment, on the scenes and seeds of both."""
-    compared = comparable({name: [run for run in runs if run["variant"] == name] for name in (first, second)})
+def differences(runs: list[Run], reference: list[Run], seconds: float) -> dict[str, float]:
+    """Scene -> by how many dB some runs are ahead of others at a moment; both are on the same scenes and seeds."""
     ahead = {}
-    for scene in scenes_of(compared.get(first, [])):
-        psnr, reference = (mean_psnr_at(runs_on(compared[name], [scene]), seconds) for name in (first, second))
-        if psnr is not None and reference is not None:
-            ahead[scene] = psnr - reference
+    for scene in scenes_of(runs):
+        psnr, reference_psnr = (mean_psnr_at(runs_on(found, [scene]), seconds) for found in (runs, reference))
+        if psnr is not None and reference_psnr is not None:
+            ahead[scene] = psnr - reference_psnr
     return ahead
