@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_config, tiny_rays, tiny_views
+from tiny import resume_trainer, tiny_config, tiny_rays, tiny_trainer, tiny_views
 
+from edge_se_sampler.bench.overrides import override
 from edge_se_sampler.data.cameras import RayBundle
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
-from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.reinitialization import PATIENCE, DeadNetworkReset, dead_networks
-from edge_se_sampler.engine.resolve import resolve_config
-from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import STRATEGIES, method_configs
 from edge_se_sampler.models.nerf import NeRFModel
-from edge_se_sampler.sampling import schedule
 
 VIEWS = tiny_views(3, 12, 12)
 
 
-def trainer_of(
-    folder: Path, method: str = "vanilla-nerf", *, reinit_dead: bool = True, seed: int = 0, schedule: str = "fraction"
-) -> Trainer:
-    config: TrainerConfig = method_configs()[method]
-    settings: dict[str, Any] = {"schedule": schedule}
-    sampler = replace(config.pipeline.datamanager.pixel_sampler, **settings)
-    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=16, pixel_sampler=sampler)
-    pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(width=16, depth=2))
-    machine = replace(config.machine, seed=seed)
-    config = replace(config, pipeline=pipeline, max_num_iterations=400, machine=machine, reinit_dead=reinit_dead)
-    config = resolve_config(replace(config, output_dir=folder, experiment_name="e"), VIEWS)
-    return config.setup(run=RunFolder.create(config), pipeline=Pipeline.build(config, VIEWS, "cpu"), preview=None)
+def trainer_of(folder: Path, method: str = "vanilla-nerf", *, reinit_dead: bool = True, seed: int = 0) -> Trainer:
+    config = override(
+        method_configs()[method],
+        {
+            "pipeline.datamanager.train_num_rays_per_batch": 16,
+            "pipeline.model": tiny_config(width=16, depth=2),
+            "max_num_iterations": 400,
+            "machine.seed": seed,
+            "reinit_dead": reinit_dead,
+        },
+    )
+    return tiny_trainer(config, VIEWS, folder)
 
 
 def reset_of(trainer: Trainer) -> DeadNetworkReset:
@@ -151,8 +145,7 @@ def test_a_checkpoint_keeps_the_count_of_steps_and_of_sub_seeds(saved_after: int
     trainer.save()
     went_on = [trainer.train_iteration(step) for step in range(saved_after, saved_after + 12)]
 
-    resumed = trainer.config.setup(run=trainer.run, pipeline=Pipeline.build(trainer.config, VIEWS, "cpu"), preview=None)
-    resumed.resume(load_checkpoint(latest_checkpoint(resumed.run.checkpoints), config_digest(resumed.config)))
+    resumed = resume_trainer(trainer, VIEWS)
     assert resumed.next_step == saved_after
     assert [resumed.train_iteration(step) for step in range(saved_after, saved_after + 12)] == went_on
     assert reset_of(resumed).used_sub_seeds == reset_of(trainer).used_sub_seeds >= 2
@@ -164,28 +157,3 @@ def test_the_probe_rays_cover_every_image(tmp_path: Path) -> None:
     assert np.unique(numbers.numpy()).tolist() == [0, 1, 2]
     again = reset_of(trainer_of(tmp_path))
     torch.testing.assert_close(again.probe.origins, reset_of(trainer).probe.origins)
-
-
-@pytest.mark.parametrize("saved_after", [10, 30, 40])
-def test_a_checkpoint_keeps_the_adaptive_schedules_state(
-    saved_after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Saved in the early phase, in the late one, and in the early one that follows: all three are forced."""
-    monkeypatch.setattr(schedule, "GAIN_TO_END", float("inf"))
-    monkeypatch.setattr(schedule, "REMAINING_TO_END", 1e6)
-    monkeypatch.setattr(schedule, "REMAINING_TO_RETURN", 0.0)
-    trainer = trainer_of(tmp_path, "edge-se-nerf", schedule="adaptive")
-    sampler: Any = trainer.pipeline.datamanager.train_pixel_sampler
-    for step in range(saved_after):
-        trainer.train_iteration(step)
-        trainer.next_step = step + 1
-    expected = {10: "edge", 30: "se", 40: "edge"}[saved_after]
-    assert sampler.strategy == expected
-    trainer.save()
-    went_on = [(trainer.train_iteration(step), sampler.strategy) for step in range(saved_after, saved_after + 30)]
-    assert len({strategy for _, strategy in went_on}) == 2
-
-    resumed = trainer.config.setup(run=trainer.run, pipeline=Pipeline.build(trainer.config, VIEWS, "cpu"), preview=None)
-    resumed.resume(load_checkpoint(latest_checkpoint(resumed.run.checkpoints), config_digest(resumed.config)))
-    again: Any = resumed.pipeline.datamanager.train_pixel_sampler
-    assert [(resumed.train_iteration(step), again.strategy) for step in range(saved_after, saved_after + 30)] == went_on

@@ -1,4 +1,4 @@
-"""An interrupted and resumed run equals the uninterrupted one bit for bit, each part in a process of its own."""
+"""An interrupted and resumed run equals the uninterrupted one bit for bit."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from typing import Any
 
 import pytest
 import torch
+from tiny import resume_trainer, tiny_config, tiny_trainer, tiny_views
 
+from edge_se_sampler.bench.overrides import override
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
+from edge_se_sampler.methods import method_configs
+from edge_se_sampler.sampling import schedule
 
 SESSION = """
 import hashlib, json, os, signal, sys
@@ -120,6 +124,36 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, 
     assert metrics(run) == metrics(Path(whole["run"]))
     assert state(run) == state(Path(whole["run"]))
     assert any(isinstance(value, bytes) for value in state(run).values())
+
+
+@pytest.mark.parametrize(("saved_after", "phase"), [(10, "edge"), (30, "se"), (40, "edge")])
+def test_a_checkpoint_keeps_the_adaptive_schedules_state(
+    saved_after: int, phase: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Saved in the early phase, in the late one, and in the early one that follows: all three are forced."""
+    monkeypatch.setattr(schedule, "GAIN_TO_END", float("inf"))
+    monkeypatch.setattr(schedule, "REMAINING_TO_END", 1e6)
+    monkeypatch.setattr(schedule, "REMAINING_TO_RETURN", 0.0)
+    views = tiny_views(3, 12, 12)
+    changes = {
+        "pipeline.datamanager.train_num_rays_per_batch": 16,
+        "pipeline.datamanager.pixel_sampler.schedule": "adaptive",
+        "pipeline.model": tiny_config(),
+        "max_num_iterations": 400,
+    }
+    trainer = tiny_trainer(override(method_configs()["edge-se-nerf"], changes), views, tmp_path)
+
+    def train(trainer: Any, steps: range) -> list[tuple[float, str]]:
+        sampler = trainer.pipeline.datamanager.train_pixel_sampler
+        return [(trainer.train_iteration(step), sampler.strategy) for step in steps]
+
+    assert train(trainer, range(saved_after))[-1][1] == phase
+    trainer.next_step = saved_after
+    trainer.save()
+    later = range(saved_after, saved_after + 30)
+    went_on = train(trainer, later)
+    assert {strategy for _, strategy in went_on} == {"edge", "se"}
+    assert train(resume_trainer(trainer, views), later) == went_on
 
 
 def test_ctrl_c_saves_a_checkpoint_and_prints_one_line(tmp_path: Path, scene: Path):

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from tiny import tiny_config, tiny_views
+from tiny import tiny_config, tiny_trainer, tiny_views
 
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.resolve import resolve_config
-from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer, create_adam
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import nerf as model_module
@@ -28,9 +24,7 @@ def trainer_of(method: str = "edge-se-nerf", steps: int = 20, optimizer: Any = N
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=RAYS)
     pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(**model))
     optimizer = OptimizerConfig(lr=1e-2) if optimizer is None else optimizer
-    config = resolve_config(replace(config, pipeline=pipeline, max_num_iterations=steps, optimizer=optimizer), VIEWS)
-    run = RunFolder(Path("never written"))
-    return config.setup(run=run, pipeline=Pipeline.build(config, VIEWS, "cpu"), preview=None)
+    return tiny_trainer(replace(config, pipeline=pipeline, max_num_iterations=steps, optimizer=optimizer), VIEWS)
 
 
 def gradients(trainer: Trainer) -> torch.Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,12 @@ from torch import nn
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.resolve import resolve_config
+from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import RayModel
@@ -110,3 +117,18 @@ def check_gradients(model: nn.Module, loss: Callable[[], torch.Tensor]) -> None:
             parameter += h * step
         numeric = (values[0] - values[1]) / (2 * h)
         assert numeric == pytest.approx(analytic, rel=1e-4, abs=1e-7), name
+
+
+def tiny_trainer(config: TrainerConfig, views: Views, output_dir: Path | None = None) -> Trainer:
+    """A trainer on views; without a folder for its run it can take steps, which write nothing, but not save."""
+    config = resolve_config(replace(config, output_dir=output_dir or config.output_dir), views)
+    run = RunFolder.create(config) if output_dir else RunFolder(Path("never written"))
+    return config.setup(run=run, pipeline=Pipeline.build(config, views, "cpu"), preview=None)
+
+
+def resume_trainer(trainer: Trainer, views: Views) -> Trainer:
+    """Another trainer, which continues from the last checkpoint of this one."""
+    config, run = trainer.config, trainer.run
+    resumed = config.setup(run=run, pipeline=Pipeline.build(config, views, "cpu"), preview=None)
+    resumed.resume(load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config)))
+    return resumed
