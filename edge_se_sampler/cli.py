@@ -43,13 +43,9 @@ def _exit(message: str, code: int) -> NoReturn:
 
 
 def _is_out_of_memory(problem: Exception) -> bool:
-    """Whether an allocation failed. torch has a type for that on a GPU; on a CPU it raises a RuntimeError that nothing
-    but its allocator's name tells from others."""
-    return (
-        isinstance(problem, MemoryError)
-        or type(problem).__name__ == "OutOfMemoryError"
-        or "DefaultCPUAllocator" in str(problem)
-    )
+    """Whether an allocation failed: torch has a type for that on a GPU, but names its allocator on a CPU."""
+    is_of_type = isinstance(problem, MemoryError) or type(problem).__name__ == "OutOfMemoryError"
+    return is_of_type or "DefaultCPUAllocator" in str(problem)
 
 
 def _run(arguments: list[str]) -> None:

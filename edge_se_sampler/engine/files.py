@@ -67,7 +67,7 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """The content of a PNG file of an (H, W, 3) float image in [0, 1]."""
+    """An (H, W, 3) float image in [0, 1] as a PNG file's content."""
     return iio.imwrite("<bytes>", to_uint8(image), extension=".png")
 
 

@@ -1,9 +1,4 @@
-"""Image metrics of novel view synthesis. Images are (H, W, 3|4) floats in [0, 1], alpha straight.
-
-mse   mean squared error over pixels and channels
-PSNR  -10 log10(mse), in dB
-SSIM  structural similarity (Wang et al. 2004)
-"""
+"""Image metrics of novel view synthesis. Images are (H, W, 3|4) floats in [0, 1], alpha straight."""
 
 from __future__ import annotations
 
@@ -29,15 +24,14 @@ def composite_on(image: np.ndarray, background_color: float = 1.0) -> np.ndarray
 
 
 def psnr(mse: float) -> float:
-    """Mean squared error -> dB; an exact match counts as 100 dB, so that results stay valid json."""
+    """-10 log10(mse), in dB; an exact match counts as 100 dB, so that results stay valid json."""
     return 100.0 if mse <= 1e-10 else -10 * math.log10(mse)
 
 
 def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
-    """Mean over pixels and channels of the structural similarity of two (H, W, 3) images.
+    """Mean over pixels and channels of the structural similarity (Wang et al. 2004) of two (H, W, 3) images.
 
-    As Wang et al. define it: a Gaussian window, and no pixel whose window leaves the image. None for images with a side
-    shorter than the window: they have no such pixel.
+    Windows are Gaussian and lie within the image; None if an image's side is shorter than a window.
     """
     if min(first.shape[:2]) < SSIM_WINDOW:
         return None
@@ -65,7 +59,8 @@ def compute_metrics(rendered: np.ndarray, image: np.ndarray, background_color: f
     """All metrics of a rendering (H, W, 3) of an image; None where there is nothing to measure (no alpha, no object).
 
     Returns:
-        mse, psnr, ssim, foreground_psnr (where alpha > 0), edge_band_psnr, background_mse (where alpha = 0).
+        mse (over pixels and channels), psnr, ssim, edge_band_psnr, foreground_psnr (where alpha > 0),
+        background_mse (where alpha = 0).
     """
     target = composite_on(image, background_color)
     error = ((rendered.astype(np.float64) - target) ** 2).mean(axis=2)

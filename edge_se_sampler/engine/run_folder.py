@@ -45,10 +45,7 @@ class RunFolder:
         return self.path / "checkpoints"
 
     def config(self, method_configs: Mapping[str, TrainerConfig]) -> TrainerConfig:
-        """The run's settings.
-
-        Args:
-            method_configs: the default settings of every method by name; the run's are of the same types.
+        """The run's settings, of the same types as its method's defaults.
 
         Raises:
             InputError: no run folder, or its config.json is broken or of another version.
@@ -124,8 +121,7 @@ def config_digest(config: TrainerConfig) -> str:
 def config_from_json(default: Any, values: Any, where: str) -> Any:
     """The (nested) config dataclass that `config_to_json` turned into these values.
 
-    Raises:
-        InputError: fields that are missing, unknown or of another type: another version wrote it.
+    InputError if fields are missing, unknown or of another type.
     """
     fields = {field.name: field for field in dataclasses.fields(default)}
     if not isinstance(values, dict) or set(values) != set(fields):

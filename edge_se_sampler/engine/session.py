@@ -32,8 +32,8 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: Occupancy
     """Read the data, resolve the config, and set up a trainer.
 
     Args:
-        run: the folder of a run that is continued, grid: the occupancy grid of its checkpoint; by default a new folder
-            is created, and the grid is the scene's.
+        run: the folder of a run to continue; by default a new one.
+        grid: the occupancy grid in that run's checkpoint; by default the scene's.
 
     Raises:
         InputError: bad data or settings; nothing is written then.
@@ -62,11 +62,7 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
 
 
 def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
-    """A run's model with the weights of its last checkpoint, and that checkpoint; config is `run.config`'s.
-
-    Raises:
-        InputError: no checkpoint, or a bad one.
-    """
+    """A run's model with the weights of its last checkpoint, and that checkpoint; InputError if it is bad."""
     checkpoint = latest_checkpoint(run.checkpoints)
     state = load_checkpoint(checkpoint, config_digest(config))
     model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
@@ -75,11 +71,7 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
 
 
 def read_test_views(config: TrainerConfig) -> Views:
-    """The held-out views of a run: its test split, or val where there is no test.
-
-    Raises:
-        InputError: neither exists, or one of them is bad.
-    """
+    """The held-out views of a run: its test split, or val where there is no test; InputError if there is neither."""
     if config.data is None or not config.data.is_dir():
         raise InputError(f"{config.data}: no such folder, where this run's held-out views were")
     views = _read_first_split(config, ("test", "val"))
@@ -109,12 +101,9 @@ def read_train_views(config: TrainerConfig) -> Views:
 
 
 def select_views(config: TrainerConfig, count: int) -> list[int] | None:
-    """Indices of the views to train on; None: all `count` of them.
+    """Indices of the views to train on; None: all `count` of them. InputError if the flags do not fit.
 
     --num-views selects as InfoNeRF's public code does, numpy.random.RandomState(0).permutation(count)[:k].
-
-    Raises:
-        InputError: both flags, more views than there are, an index twice or out of range.
     """
     number, views = config.num_views, config.views
     if number is not None:

@@ -30,13 +30,11 @@ def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np
 
 
 def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Path, num_views: int, seed: int) -> None:
-    """Draw the figure, and write it as PNG.
+    """Draw num_views of the training views, evenly spaced, and write the figure as PNG.
 
     Args:
-        views: training views.
         config: the sampler's; num_rays_per_batch pixels are drawn from each view.
         strategy: "uniform", "precrop" or "edge".
-        num_views: number of views shown, evenly spaced.
 
     Raises:
         InputError: matplotlib is missing, or the settings do not fit the images.

@@ -11,8 +11,7 @@ class EventWriter:
     """Writes the numbers of metrics.jsonl's lines as scalars; without the extra it does nothing."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._writer: Any = None
+        self._folder, self._writer = folder, None
 
     def write(self, line: dict[str, Any]) -> None:
         """Add every number of a metrics line at its step."""

@@ -66,9 +66,7 @@ class Trainer:
     def train(self) -> None:
         """Train until the planned iterations are done, max_seconds have passed, or Ctrl-C; then save.
 
-        Raises:
-            FloatingPointError: the loss or a weight is not finite; the last checkpoint is kept.
-            InputError: a file cannot be written.
+        FloatingPointError if the loss or a weight is not finite: the last checkpoint is kept.
         """
         config = self.config
         began = time.monotonic() - self.elapsed
@@ -144,12 +142,7 @@ class Trainer:
         return loss
 
     def save(self) -> None:
-        """Write a checkpoint of the steps done so far.
-
-        Raises:
-            FloatingPointError: a weight is not finite; nothing is written.
-            InputError: it cannot be written.
-        """
+        """Write a checkpoint of the steps done so far; FloatingPointError, and no file, if a weight is not finite."""
         step = self.next_step - 1
         if not all(torch.isfinite(weight).all() for weight in self.pipeline.model.parameters()):
             raise FloatingPointError(f"a weight is not finite after step {step}; try a lower --optimizer.lr")
