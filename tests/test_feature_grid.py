@@ -14,10 +14,11 @@ from edge_se_sampler.occupancy.grid import OccupancyGrid, upsample
 from edge_se_sampler.occupancy.hull import Hull
 
 SIDE = 0.5
+AABB_MIN = np.array([-1.0, 0.5, 2.0])
 
 
-def grid(shown: np.ndarray) -> OccupancyGrid:
-    return OccupancyGrid.from_hull(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown)).double()
+def grid(shown: np.ndarray, max_level: int = 0) -> OccupancyGrid:
+    return OccupancyGrid.from_hull(Hull(AABB_MIN, SIDE, shown), max_level).double()
 
 
 def inside(shown: np.ndarray, count: int = 300) -> torch.Tensor:
@@ -25,7 +26,7 @@ def inside(shown: np.ndarray, count: int = 300) -> torch.Tensor:
     rng = np.random.default_rng(0)
     cells = np.argwhere(shown)
     at = cells[rng.integers(len(cells), size=count)] + rng.random((count, 3))
-    return torch.from_numpy(np.array([-1.0, 0.5, 2.0]) + at * SIDE)
+    return torch.from_numpy(AABB_MIN + at * SIDE)
 
 
 def features_at(features: FeatureGrid, points: torch.Tensor) -> torch.Tensor:
@@ -99,7 +100,7 @@ def random_features(cells: OccupancyGrid) -> FeatureGrid:
 
 def refine_some(shown: np.ndarray, max_level: int = 1) -> tuple[FeatureGrid, torch.Tensor]:
     """A grid subdivided to a level, about half of its cells refined, and which these are."""
-    cells = OccupancyGrid.from_hull(Hull(np.array([-1.0, 0.5, 2.0]), SIDE, shown), max_level).double()
+    cells = grid(shown, max_level)
     features = random_features(cells)
     refined = cells.static_mask & (
         torch.rand(cells.static_mask.shape, generator=torch.Generator().manual_seed(1)) < 0.5

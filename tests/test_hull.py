@@ -121,13 +121,13 @@ def test_the_box_is_where_the_cameras_look_and_as_large_as_their_depths() -> Non
 
 @pytest.mark.parametrize("apart", [0.02, -0.005])
 def test_cameras_side_by_side_look_at_what_is_before_them(apart: float) -> None:
-    """Axes that run a little apart meet behind the cameras, or far beyond what is sampled: no middle to build on."""
+    """Axes that run a little apart meet behind the cameras, or far beyond what is sampled: no center to use."""
     views = views_of(rods(), count=5)
-    turn = np.sin(np.linspace(-apart, apart, 5))
-    ahead = np.stack((turn, np.zeros(5), -np.sqrt(1 - turn**2)), axis=1)
-    right = np.cross(ahead, (0, 1, 0))
+    sine = np.sin(np.linspace(-apart, apart, 5))
+    forward = np.stack((sine, np.zeros(5), -np.sqrt(1 - sine**2)), axis=1)
+    right = np.cross(forward, (0, 1, 0))
     position = np.stack((np.linspace(-0.5, 0.5, 5), np.zeros(5), np.full(5, 3.0)), axis=1)
-    poses = np.stack((right, np.broadcast_to((0.0, 1.0, 0.0), right.shape), -ahead, position), axis=2)
+    poses = np.stack((right, np.broadcast_to((0.0, 1.0, 0.0), right.shape), -forward, position), axis=2)
     side = with_cameras(views, camera_to_worlds=torch.from_numpy(poses))
     box = find_box(side, 2, 6)
     np.testing.assert_allclose(box.center, (0, 0, -1), atol=0.01)  # 4 ahead of them
@@ -332,7 +332,7 @@ def test_masks_that_do_not_agree_carve_nothing(apart: int, capfd: pytest.Capture
     assert missed(views, analysis.hull) == 0
 
 
-def test_cells_are_as_large_as_a_pixel_asks_or_as_many_as_are_worth_it() -> None:
+def test_voxel_size_px_sets_the_size_of_cells_unless_there_would_be_too_many() -> None:
     views = views_of(rods())
     fine = analyze_views(views, LeanModelConfig(voxel_size_px=1.6))
     assert fine.hull.cell_size == pytest.approx(1.6 * fine.box.pixel_footprint)
@@ -348,7 +348,7 @@ def test_where_nothing_is_carved_cells_begin_large_enough_to_be_subdivided(size:
     assert analysis.max_level == max_level
     assert analysis.hull.cells.sum() <= 1.3 * MAX_OCCUPIED_CELLS / 8
     assert analysis.hull.cells.size * 8**analysis.max_level < MAX_GRID_CELLS
-    if size == 100:  # as near as halving comes to what a pixel asks
+    if size == 100:  # as near as halving comes to a pixel's footprint
         assert 2**-0.5 < analysis.hull.cell_size / 2**max_level / analysis.box.pixel_footprint < 2**0.5
     for unpruned in (
         analyze_views(views, LeanModelConfig(cull_by_density=False)),
