@@ -76,9 +76,7 @@ def test_gradients_of_everything_against_finite_differences() -> None:
     check_gradients(model, lambda: loss_of(model))
 
 
-def test_culled_rendering_equals_dense_rendering_of_zeros_outside(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_culled_rendering_equals_dense_rendering_of_zeros_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same samples in a box that is wholly occupied, their density set to 0 outside of the ball."""
     hull = ball()
     culled = model_in(hull).eval()

@@ -70,13 +70,7 @@ def test_nothing_is_left_open(size: Any) -> None:
         nested = [name for value in fields.values() if dataclasses.is_dataclass(value) for name in left_open(value)]
         return nested + [name for name, value in fields.items() if value is None or value == "auto"]
 
-    assert left_open(resolved) == [
-        "device_type",
-        "data",
-        "num_views",
-        "views",
-        "max_seconds",
-    ]
+    assert left_open(resolved) == ["device_type", "data", "num_views", "views", "max_seconds"]
     assert (
         resolve_config(resolved, of_size(800, 800)) == resolved
     )  # planning what is planned changes nothing, whatever the data

@@ -22,11 +22,8 @@ NUM_VIEWS = 3
 
 
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
-    """What is derived from training views, one finding a line; draws it too. The config's size may be auto.
-
-    Raises:
-        InputError: a setting is out of its range, matplotlib is missing, or the picture cannot be written.
-    """
+    """What is derived from training views, one finding a line; draws it too. The config's size may be auto. InputError
+    if a setting is out of its range, matplotlib is missing, or the picture cannot be written."""
     pyplot = require_pyplot()
     config = decide_size(config, views.images)
     config.check()

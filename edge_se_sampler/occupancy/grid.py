@@ -153,10 +153,9 @@ class OccupancyGrid(nn.Module):
     def march(
         self, rays: RayBundle, step: float, jitter: Tensor | None, depths: tuple[float, float] = (0, float("inf"))
     ) -> Samples:
-        """Samples a step apart wherever a ray is in an occupied cell.
+        """Samples a step apart (world units) wherever a ray is in an occupied cell.
 
         Args:
-            step: world units.
             jitter: (n, 1) in [0, 1): share of a step before the first sample; None: half a step.
             depths: near and far along the camera's axis, world units.
         """

@@ -86,13 +86,9 @@ class Box:
 
 
 def find_box(views: Views, near: float, far: float) -> Box:
-    """The cube around the point nearest to all optical axes that reaches as far along every axis as rays are sampled.
-    Where that point is not between near and far (axes that are parallel, or diverge), it is around the mean point
-    halfway between them.
-
-    Args:
-        near, far: depths between which rays are sampled, world units.
-    """
+    """The cube around the point nearest to all optical axes that reaches as far along every axis as rays are sampled,
+    from depth near to far, world units. Where that point is not between these (axes that are parallel, or diverge), it
+    is around the mean point halfway between them."""
     poses = views.cameras.camera_to_worlds.numpy()
     position, forward = poses[:, :, 3], -poses[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
@@ -174,10 +170,7 @@ def _may_hold_something(
 def project_cells(
     cameras: Cameras, camera: int, centers: np.ndarray, cell_size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rectangles into which one camera projects cells.
-
-    Args:
-        centers: (m, 3) of the cells, world units.
+    """The rectangles into which one camera projects cells, by their centers (m, 3), world units.
 
     Returns:
         least and greatest u, v (2, m) each, without meaning for cells that are not in front of the camera; whether each

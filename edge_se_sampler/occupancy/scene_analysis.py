@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -97,12 +98,10 @@ def _missed_fraction(views: Views, silhouettes: dict[int, Silhouette], hull: Hul
 
 def pick_pixels(masks: Mapping[int, np.ndarray], max_pixels: int = 4096) -> torch.Tensor:
     """Pixels in masks (H, W) by image index, evenly spread and at most so many: (n, 3) int64 image, row, column."""
-    counts = [np.count_nonzero(mask) for mask in masks.values()]
-    ends = np.cumsum(counts)
+    ends = np.cumsum([0, *(int(mask.sum()) for mask in masks.values())])
     chosen = np.linspace(0, ends[-1] - 1, min(max_pixels, ends[-1])).astype(int)
     pixels = []
-    for (index, mask), count, end in zip(masks.items(), counts, ends, strict=True):
-        in_mask = chosen[(chosen >= end - count) & (chosen < end)] - (end - count)
-        row, column = np.divmod(np.flatnonzero(mask)[in_mask], mask.shape[1])
-        pixels.append(np.stack((np.full(len(in_mask), index), row, column), axis=1))
+    for (index, mask), (begin, end) in zip(masks.items(), pairwise(ends), strict=True):
+        in_mask = chosen[(chosen >= begin) & (chosen < end)] - begin
+        pixels.append(np.insert(np.argwhere(mask)[in_mask], 0, index, axis=1))
     return torch.from_numpy(np.concatenate(pixels))
