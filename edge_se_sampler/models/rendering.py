@@ -38,6 +38,6 @@ def opacity(sigma: Tensor, delta: Tensor) -> Tensor:
 
 
 def composite(weights: Tensor, colors: Tensor, background: Tensor) -> Tensor:
-    """Colors (n, 3) of rays, from their samples' weights (n, s) and colors (n, s, 3), on a background (3,) or (n, 3)."""
+    """Colors (n, 3) of rays, from their samples' weights (n, s) and colors (n, s, 3), on background (3,) or (n, 3)."""
     rendered = (weights[:, None, :] @ colors)[:, 0]
     return rendered + (1 - weights.sum(dim=1, keepdim=True)) * background
