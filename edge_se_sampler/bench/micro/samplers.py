@@ -17,7 +17,6 @@ from edge_se_sampler.bench.timing import median_milliseconds
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.methods import method_configs
@@ -41,15 +40,12 @@ def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
     every_image, one_image = torch.arange(images), torch.tensor([images // 2])
     uniform = UniformPixels([(size, size)] * images)
     flat_cdf = torch.cumsum(torch.rand(images * size * size, dtype=torch.float64), dim=0)
-    errors = torch.rand(2 * draws)
-    extent = torch.tensor([images, size, size])
+    total, errors, extent = flat_cdf[-1], torch.rand(2 * draws), torch.tensor([images, size, size])
     cases: dict[str, Callable[[int], Any]] = {
         "edge_all_images": lambda step: table.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
         "edge_one_image": lambda step: table.draw(one_image, draws, stream(0, step, Stream.PIXELS)),
         "uniform_all_images": lambda step: uniform.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
-        "flat_searchsorted": lambda _: torch.searchsorted(
-            flat_cdf, torch.rand(draws, dtype=torch.float64) * flat_cdf[-1]
-        ),
+        "flat_searchsorted": lambda _: torch.searchsorted(flat_cdf, torch.rand(draws, dtype=torch.float64) * total),
         "se_selection": lambda step: sample_by_rank(errors, draws, stream(0, step, Stream.SELECTION)),
         # what PixelSampler.sample_method of nerfstudio 1.1.5 computes without a mask
         "nerfstudio_uniform": lambda _: (torch.rand((draws, 3)) * extent).long(),
@@ -65,13 +61,8 @@ def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:
     noise = [np.random.default_rng(i).integers(0, 256, (size, size, 4), dtype=np.uint8) for i in range(min(images, 8))]
     table = PixelTable()
     memory_before, start = resident_memory(), time.perf_counter()
-    with Progress(images, "building tables") as progress:
-
-        def measure_edges(i: int) -> torch.Tensor:
-            progress.update(i + 1)
-            return torch.from_numpy(edge_strength(noise[i % len(noise)]) + EPSILON)
-
-        table.add(in_threads(measure_edges, range(images)))
+    edges = in_threads(lambda i: torch.from_numpy(edge_strength(noise[i % len(noise)]) + EPSILON), range(images))
+    table.add(edges)
     seconds = time.perf_counter() - start
     pixels = images * size * size
     return table, {
@@ -82,10 +73,7 @@ def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:
 
 
 def training_peak(method: str, rays: int, size: str, error_source: str = "fine") -> int:
-    """Resident bytes, above the level after imports, of a few training steps of the late phase in a fresh process.
-
-    Args: as `late_phase`.
-    """
+    """Resident bytes, above the level after imports, of a few steps of the `late_phase` in a fresh process."""
     return run_in_subprocess(_training_peak, method, late_phase(rays, size, error_source))
 
 

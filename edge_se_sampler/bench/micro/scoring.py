@@ -1,5 +1,4 @@
-"""`edge-se bench scoring`: what squared errors cost, taken from the fine network, from the coarse one, or from a cache
-of earlier errors, and how well the cheap ones rank pixels as the fine ones do.
+"""`edge-se bench scoring`: what squared errors of each source cost, and how well the cheap ones rank pixels.
 
 Steps of the late phase are timed in turns within one process; peaks of memory in a fresh process each.
 """
@@ -31,13 +30,7 @@ NUM_RANKED = 4096
 
 
 def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
-    """Measure on a synthetic scene.
-
-    Args:
-        size: of the networks, as `--pipeline.model.size`.
-        rays: pixels per step.
-        rounds: timed steps of each.
-        iterations: of training before rankings are compared.
+    """Measure on a synthetic scene; the arguments are the flags of `BenchScoring`.
 
     Returns:
         median `milliseconds` per step of Random and of each error source, `memory_against_random` of each error source

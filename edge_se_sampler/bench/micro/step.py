@@ -30,7 +30,6 @@ def measure(checkout: Path, workplace: Path, rounds: int, size: str = "paper", r
 
     Args:
         checkout: of nerf-pytorch.
-        workplace: where the scene is, or is rendered.
         rounds: timed steps of each.
         size, rays: of vanilla-nerf; nerf-pytorch's are the paper's.
 

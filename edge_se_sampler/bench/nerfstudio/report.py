@@ -9,7 +9,7 @@ from typing import Any
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.bench.tables import describe_machine, markdown_table
+from edge_se_sampler.bench.tables import describe_command, markdown_table
 
 LABELS = {"vanilla-nerf": "`vanilla-nerf`: nerfstudio's uniform pixels", "edge-se-nerf": "`edge-se-nerf`: Edge + SE"}
 
@@ -22,10 +22,9 @@ def describe(folder: Path) -> str:
     """
     result = read_result(folder / "result.json")
     parts = {"failures": _tabulate_failures(result["runs"]), "failure_rule": FAILURE_RULE}
-    parts |= {"command": result["command"], "machine": describe_machine(result["machine"])}
     if "costs" in result:
         parts |= {"cost_rays": result["costs"]["rays"], "costs": _tabulate_costs(result["costs"]["medians"])}
-    return fill_template(__file__, folder, **result["settings"], **parts)
+    return fill_template(__file__, folder, **result["settings"], **parts, reproduce=describe_command(result))
 
 
 def _tabulate_failures(runs: list[Run]) -> str:
@@ -41,7 +40,6 @@ def _tabulate_failures(runs: list[Run]) -> str:
 
 
 def _tabulate_costs(medians: dict[str, Any]) -> str:
-    """Of steps by squared error, as ratios to uniform ones."""
     rows = []
     for method in sorted({case.split()[0] for case in medians}):
         se, uniform = medians[f"{method} se"], medians[f"{method} uniform"]

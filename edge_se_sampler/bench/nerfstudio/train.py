@@ -1,7 +1,6 @@
 """Trainings and timed steps inside nerfstudio: its own pixel sampler against Edge + SE.
 
-nerfstudio's vanilla NeRF has a softplus density, torch's initial weights and RAdam; the two methods differ in their
-data managers alone.
+Its vanilla NeRF has a softplus density, torch's initial weights and RAdam; the methods differ in their data managers.
 """
 
 from __future__ import annotations

@@ -22,12 +22,7 @@ SIZE = 48
 NUM_TRAIN, NUM_TEST = 40, 4
 SHIFT = (10, 7)
 """Pixels, right and down, off centre: about as far from the middle, as a share of the image, as in the demo."""
-COLORS: dict[str, tuple[float, float, float]] = {
-    "white": (1.0, 1.0, 1.0),
-    "black": (0.0, 0.0, 0.0),
-    "grey": (0.5, 0.5, 0.5),
-    "green": (0.1, 0.75, 0.2),
-}
+COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "green": (0.1, 0.75, 0.2)}
 
 
 @lru_cache(maxsize=4)
@@ -67,8 +62,7 @@ def background_of(background: Background) -> Callable[[RayBundle], Tensor] | Non
         return None
     if background == "textured":
         return _stripes
-    color = torch.tensor(COLORS[background])
-    return lambda rays: color.to(rays.origins).expand(len(rays), 3)
+    return lambda rays: rays.origins.new_tensor(COLORS[background]).expand(len(rays), 3)
 
 
 def _stripes(rays: RayBundle) -> Tensor:

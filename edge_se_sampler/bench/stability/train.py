@@ -100,12 +100,15 @@ def run_trial(trial: Trial, size: TrainingSize, views_folder: Path) -> dict[str,
     if modes["fine"] is not None:
         views_folder.mkdir(parents=True, exist_ok=True)
         write_atomically(views_folder / f"{trial.name}.png", png_bytes(panel(model, pictures[0])))
-    measures = {network: asdict(result) for network, result in rendered.items()}
-    return {
+    run: dict[str, Any] = {
         "outcome": rendered["fine"].outcome,
         "failure_mode": modes["fine"],
         "coarse_failure_mode": modes["coarse"],
-        **{f"{network}_{key}": round(value, 4) for network in measures for key, value in measures[network].items()},
+    }
+    for network, result in rendered.items():
+        run |= {f"{network}_{key}": round(value, 4) for key, value in asdict(result).items()}
+    return {
+        **run,
         "dead_at_start": dead,
         "reinitialized": 0 if resets is None else resets.used_sub_seeds,
         "shares": shares,
