@@ -18,7 +18,7 @@ class Progress(AbstractContextManager):
     """Shows on stderr what part of a job is done and how long the rest will take.
 
     Args:
-        total: steps of the whole job; 0 where `update` will tell.
+        total: steps of the whole job; 0 if only `update` gets to know.
         start: steps done in an earlier session.
         clock: seconds, for the lines of a log.
     """

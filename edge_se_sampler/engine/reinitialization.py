@@ -26,7 +26,7 @@ PROBE_RAYS = 512
 def dead_networks(model: RayModel, probes: Iterable[RayBundle]) -> list[str]:
     """Names of the model's networks that have no density at any sample of the rays.
 
-    Accumulation tells: the last interval is endless, so that the smallest density anywhere makes its ray opaque.
+    Their accumulation is 0: the last interval is endless, so that the smallest density anywhere makes its ray opaque.
     """
     probes = list(probes)
     return [
@@ -39,7 +39,7 @@ class DeadNetworkReset:
     sub-seeds have been used.
 
     Args:
-        probe: fixed rays, which tell a dead network from one whose last batches were empty.
+        probe: fixed rays, which distinguish a dead network from one whose last batches were empty.
         seed: the run's.
     """
 
