@@ -32,12 +32,11 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
 def describe_command(*results: Mapping[str, Any]) -> str:
     """How to reproduce results, what that takes where it is known, and where the last of them was measured."""
     hours = sum(run.get("cpu_seconds", 0) for result in results for run in result.get("runs", ())) / 3600
-    cost = f"That takes {hours:.1f} CPU hours, shared by as many processes as there are cores. " if hours else ""
+    cost = f"That takes {hours:.1f} CPU hours. " if hours else ""
     commands = "\n".join(result["command"] for result in results)
     return (
         f"```bash\n{commands}\n```\n\n{cost}A command that was stopped goes on where it was. `edge-se bench report` "
-        "with this folder writes this page and its pictures from the numbers alone.\n\n"
-        f"Measured on: {describe_machine(results[-1]['machine'])}."
+        f"with this folder writes this page again.\n\nMeasured on: {describe_machine(results[-1]['machine'])}."
     )
 
 
