@@ -4,6 +4,7 @@ What a training loop of one's own needs can be imported from here, and is loaded
 
     from edge_se_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig, PixelTable, edge_strength, sample_by_rank
 """
+# ruff: noqa: F401  (the imports for type checkers are the public names)
 
 from __future__ import annotations
 
@@ -26,50 +27,21 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = {
-    name: module
-    for module, names in {
-        "errors": ["InputError"],
-        "protocol": ["PixelSampler", "PixelSamplerConfig"],
-        "sampling.distribution": ["PixelTable", "UniformPixels"],
-        "sampling.edges": ["edge_strength"],
-        "sampling.error_map": ["ErrorMap"],
-        "sampling.pixel_sampler": ["EdgeSEPixelSampler", "ImportantPixels"],
-        "sampling.random_streams": ["Stream", "stream"],
-        "sampling.ranking": ["Selection", "sample_by_rank"],
-        "sampling.schedule": ["AdaptiveSchedule", "FixedSchedule"],
-        "sampling.settings": ["EdgeSEPixelSamplerConfig"],
-        "sampling.parts": ["Distribution", "PixelBatch", "Selector", "TrainingStep"],
-        "sampling.strategies": ["DISTRIBUTIONS", "SELECTORS"],
-    }.items()
-    for name in names
+_NAMES = {
+    "errors": ["InputError"],
+    "protocol": ["PixelSampler", "PixelSamplerConfig"],
+    "sampling.distribution": ["PixelTable", "UniformPixels"],
+    "sampling.edges": ["edge_strength"],
+    "sampling.error_map": ["ErrorMap"],
+    "sampling.parts": ["Distribution", "PixelBatch", "Selector", "TrainingStep"],
+    "sampling.pixel_sampler": ["EdgeSEPixelSampler", "ImportantPixels"],
+    "sampling.random_streams": ["Stream", "stream"],
+    "sampling.ranking": ["Selection", "sample_by_rank"],
+    "sampling.schedule": ["AdaptiveSchedule", "FixedSchedule"],
+    "sampling.settings": ["EdgeSEPixelSamplerConfig"],
+    "sampling.strategies": ["DISTRIBUTIONS", "SELECTORS"],
 }
-
-__all__ = [
-    "DISTRIBUTIONS",
-    "SELECTORS",
-    "AdaptiveSchedule",
-    "Distribution",
-    "EdgeSEPixelSampler",
-    "EdgeSEPixelSamplerConfig",
-    "ErrorMap",
-    "FixedSchedule",
-    "ImportantPixels",
-    "InputError",
-    "PixelBatch",
-    "PixelSampler",
-    "PixelSamplerConfig",
-    "PixelTable",
-    "Selection",
-    "Selector",
-    "Stream",
-    "TrainingStep",
-    "UniformPixels",
-    "__version__",
-    "edge_strength",
-    "sample_by_rank",
-    "stream",
-]
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
@@ -79,4 +51,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_MODULES})

@@ -8,8 +8,8 @@ A package adds a method by an entry point of the group edge_se_sampler.method_co
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from importlib.metadata import entry_points
+from typing import NamedTuple
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.engine.config import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
@@ -28,20 +28,11 @@ STRATEGIES = {
 }
 """Method -> early, late, description: table 1 of the paper."""
 
-INFO_NERF = {
-    "info-nerf": ("vanilla-nerf", "InfoNeRF: NeRF from few views (--num-views), with losses on unseen rays"),
-    "edge-se-info-nerf": ("edge-se-nerf", "Edge + SE on InfoNeRF"),
-}
-"""Method -> one of `STRATEGIES`, description: the paper's other model. It takes the other strategies by flags."""
 
-
-def _paper_method(name: str) -> MethodSpecification:
-    model: NeRFModelConfig = InfoNeRFModelConfig() if name in INFO_NERF else NeRFModelConfig()
-    strategy, info_description = INFO_NERF.get(name, (name, ""))
-    early, late, description = STRATEGIES[strategy]
+def _nerf(name: str, model: NeRFModelConfig, early: str, late: str, description: str) -> MethodSpecification:
     sampler = EdgeSEPixelSamplerConfig(early=early, late=late)  # pyright: ignore[reportArgumentType]
     pipeline = PipelineConfig(datamanager=VanillaDataManagerConfig(pixel_sampler=sampler), model=model)
-    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), info_description or description)
+    return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description)
 
 
 def _lean_nerf() -> MethodSpecification:
@@ -52,8 +43,7 @@ def _lean_nerf() -> MethodSpecification:
     return MethodSpecification(config, "A small network, evaluated only where the scene is: recommended")
 
 
-@dataclass(frozen=True)
-class RegisteredMethod:
+class RegisteredMethod(NamedTuple):
     """A method, and the installed package that it comes from."""
 
     specification: MethodSpecification
@@ -63,11 +53,18 @@ class RegisteredMethod:
 def registered_methods() -> dict[str, RegisteredMethod]:
     """Every method by name: this package's, then those of other installed packages.
 
-    An entry point that fails to load, is no MethodSpecification or takes a name that exists is left out with
-    one line on stderr; it must not break the others.
+    An entry point that fails to load, is no MethodSpecification or takes a name that exists is left out with one line
+    on stderr; it must not break the others.
     """
-    ours = {name: _paper_method(name) for name in (*STRATEGIES, *INFO_NERF)} | {"lean-nerf": _lean_nerf()}
-    methods = {name: RegisteredMethod(specification, "edge_se_sampler") for name, specification in ours.items()}
+    info_nerf = "InfoNeRF: NeRF from few views (--num-views), with losses on unseen rays"
+    own_methods = [
+        *(_nerf(name, NeRFModelConfig(), *strategy) for name, strategy in STRATEGIES.items()),
+        # the paper's other model takes the other strategies by flags
+        _nerf("info-nerf", InfoNeRFModelConfig(), "uniform", "uniform", info_nerf),
+        _nerf("edge-se-info-nerf", InfoNeRFModelConfig(), "edge", "se", "Edge + SE on InfoNeRF"),
+        _lean_nerf(),
+    ]
+    methods = {method.config.method_name: RegisteredMethod(method, "edge_se_sampler") for method in own_methods}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
         origin = entry.dist.name if entry.dist else entry.value
         try:

@@ -63,16 +63,14 @@ class PixelSampler(ABC):
 
     @abstractmethod
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
-        """Choose pixels.
+        """Choose N pixels.
 
         Args:
             image_batch: `image_idx` (k,) int64 absolute numbers; `image` (k, H, W, 3|4) float in [0, 1] or uint8;
-                optionally `mask` (k, H, W, 1) bool and other per-pixel tensors. Lists of k tensors when sizes
-                differ.
+                optionally `mask` (k, H, W, 1) bool and other per-pixel tensors. Lists of k tensors when sizes differ.
 
         Returns:
-            every per-pixel key gathered at the N chosen pixels, and `indices` (N, 3) int64: absolute image
-            number, row, column.
+            every per-pixel key at these pixels, and `indices` (N, 3) int64: absolute image number, row, column.
         """
 
     def state_dict(self) -> dict[str, Any]:
@@ -91,11 +89,10 @@ class TrainingCallbackLocation(Enum):
 
 
 class CallbackPipeline(Protocol):
-    """The part of a pipeline that callbacks use."""
+    """The part of a pipeline that callbacks use: the model being trained."""
 
     @property
-    def model(self) -> Any:
-        """The model being trained."""
+    def model(self) -> Any: ...
 
 
 class CallbackTrainer(Protocol):
@@ -103,10 +100,8 @@ class CallbackTrainer(Protocol):
 
     planned_steps: int
     """Length of the run as first planned; resuming does not change it."""
-
-    @property
-    def config(self) -> Any:
-        """The run's settings; `config.machine.seed` among them."""
+    config: Any
+    """The run's settings; `config.machine.seed` among them."""
 
 
 @dataclass(frozen=True)

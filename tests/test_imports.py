@@ -1,8 +1,10 @@
-"""Imports inside the package: no circles, and only in the order of its layers."""
+"""Imports inside the package: no circles, only in the order of its layers, and nothing heavy before it is needed."""
 
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -25,6 +27,7 @@ LAYERS = [
     ("cli",),
 ]
 """Files and folders of the package. Each may import from its own layer and from earlier ones."""
+HEAVY = {"torch", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio"}
 
 
 def module_name(path: Path, root: Path) -> str:
@@ -101,3 +104,36 @@ def test_a_forbidden_import_is_found_wherever_it_stands(statement: str, tmp_path
     assert upward(imports(tmp_path)) == ["protocol imports engine.trainer"]
     (tmp_path / "protocol.py").write_text("import engine.trainer, torch\n")  # other packages are of no concern
     assert circle(imports(tmp_path)) == upward(imports(tmp_path)) == []
+
+
+def modules_loaded_by(code: str) -> set[str]:
+    """Modules that a new process has loaded after running some code."""
+    command = [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"]
+    return set(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1].split())
+
+
+@pytest.mark.parametrize(
+    ("module", "allowed"),
+    [
+        ("errors", set()),
+        ("protocol", set()),
+        ("sampling.random_streams", set()),
+        ("sampling.settings", set()),
+        ("methods", {"tyro"}),
+        ("sampling.edges", {"cv2"}),
+        ("sampling.distribution", {"torch"}),
+        ("sampling.scoring", {"torch", "cv2"}),  # and all else in sampling
+    ],
+)
+def test_importing_a_module_loads_only_what_it_needs(module: str, allowed: set[str]) -> None:
+    loaded = modules_loaded_by(f"import {PACKAGE}.{module}")
+    assert f"{PACKAGE}.{module}" in loaded
+    assert loaded & HEAVY == allowed
+
+
+def test_sampling_loads_no_files_networks_or_hosts() -> None:
+    modules = [f"{PACKAGE}.sampling.{path.stem}" for path in (ROOT / "sampling").glob("[!_]*.py")]
+    loaded = modules_loaded_by(f"import {', '.join(modules)}")
+    assert loaded >= set(modules)
+    layers = {name.split(".")[1] for name in loaded if name.startswith(f"{PACKAGE}.")}
+    assert layers == {"errors", "protocol", "sampling"}
