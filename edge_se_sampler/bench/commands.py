@@ -9,7 +9,7 @@ import tyro
 
 from edge_se_sampler.bench.baselines.command import BenchBaselines
 from edge_se_sampler.bench.chart.command import BenchChart
-from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring, BenchStep
+from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring
 from edge_se_sampler.bench.nerfstudio.command import BenchNerfstudio
 from edge_se_sampler.bench.paper.command import BenchPaper
 from edge_se_sampler.bench.schedule.command import BenchSchedule
@@ -43,6 +43,5 @@ BENCHES: dict[str, type] = {
     "schedule": BenchSchedule,
     "chart": BenchChart,
     "baselines": BenchBaselines,
-    "step": BenchStep,
     "report": BenchReport,
 }

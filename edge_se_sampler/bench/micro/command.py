@@ -1,4 +1,4 @@
-"""edge-se bench samplers, scoring and step: what sampling and training steps cost. Torch-free until one runs."""
+"""edge-se bench samplers and scoring: what sampling costs. Torch-free until one runs."""
 
 from __future__ import annotations
 
@@ -78,18 +78,3 @@ class BenchScoring(MicroBenchmark):
     """Timed steps of each; medians are reported."""
     iterations: int = 300
     """Of training before rankings are compared."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchStep(MicroBenchmark):
-    """Time the dense faithful step (1024 rays, two networks of 8 x 256, 64 + 128 samples) against nerf-pytorch's, in
-    turns. Leave the machine alone meanwhile."""
-
-    name: ClassVar[str] = "step"
-    file_name: ClassVar[str] = "step.json"
-    checkout: Path
-    """A git checkout of github.com/yenchenlin/nerf-pytorch."""
-    workplace: Path = Path("bench")
-    """Where the scene is kept."""
-    rounds: int = 8
-    """Timed steps of each; medians are reported."""

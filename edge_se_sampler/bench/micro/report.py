@@ -1,9 +1,8 @@
-"""README.md of the small benchmarks: what sampling pixels, scoring them and a dense training step cost."""
+"""README.md of the small benchmarks: what sampling pixels and scoring them cost."""
 
 from __future__ import annotations
 
 import json
-import statistics
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +38,6 @@ def describe(folder: Path) -> str:
     if "scoring" in parts:
         scored = [result for result in results if result["benchmark"] == "scoring"]
         parts["scoring"] = "\n\n".join(map(_tabulate_scoring, scored))
-    if "step" in parts:
-        ours, other = (statistics.median(parts["step"]["seconds"][name]) for name in ("vanilla-nerf", "nerf-pytorch"))
-        parts |= {"nerf_pytorch": other, "vanilla_nerf": ours, "time_ratio": ours / other}
     origins = [f"- `{result['command']}`, measured on {describe_machine(result['machine'])}" for result in results]
     return fill_template(__file__, folder, **parts, reproduce="\n".join(origins))
 
