@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -17,12 +16,11 @@ from edge_se_sampler.bench import runner
 from edge_se_sampler.bench.stability import report, scenes
 from edge_se_sampler.bench.stability import train as train_module
 from edge_se_sampler.bench.stability.scenes import COLORS, background_of, render_splits
-from edge_se_sampler.bench.stability.settings import AXES, PAIRS, SETTINGS, STRATEGIES, Setting, Trial, list_all_trials
+from edge_se_sampler.bench.stability.settings import AXES, PAIRS, SETTINGS, Setting, Trial
 from edge_se_sampler.bench.stability.train import (
     Rendered,
     TrainingSize,
     build_trainer,
-    panel,
     render_networks,
     run_trial,
 )
@@ -61,13 +59,6 @@ def test_every_setting_is_different_and_named_by_what_it_changes() -> None:
     )
     assert SETTINGS["base"] == BASE
     assert SETTINGS["off centre, 10 views"] == Setting(placement="shifted", num_views=10)
-
-
-def test_every_strategy_is_trained_with_the_same_seeds() -> None:
-    trials = list_all_trials(SETTINGS, STRATEGIES, (0, 1))
-    assert len({*trials}) == len(trials) == len(SETTINGS) * len(STRATEGIES) * 2
-    assert len({trial.name for trial in trials}) == len(trials)
-    assert [trial.seed for trial in trials] == sorted(trial.seed for trial in trials)
 
 
 # -- images
@@ -204,29 +195,13 @@ def test_edges_are_those_in_front_of_the_settings_background(background: Any, tm
     np.testing.assert_allclose(probability, edges / edges.sum(), rtol=1e-3, atol=1e-9)
 
 
-def test_a_run_repeats_itself_and_leaves_a_panel_if_it_failed(tmp_path: Path) -> None:
+def test_a_run_repeats_itself() -> None:
     trial = Trial("torch initialisation", "vanilla-nerf", 5)
-    run, repeated = (run_trial(trial, SMALL, tmp_path / "views") for _ in range(2))
+    run, repeated = (run_trial(trial, SMALL) for _ in range(2))
     assert run["failure_mode"] is not None  # after four steps
     assert len(run["shares"]) == 4
-    (path,) = (tmp_path / "views").iterdir()
-    assert path.name == f"{trial.name}.png"
-    assert iio.imread(path).shape == (24, 3 * 24, 3)
     del run["cpu_seconds"], repeated["cpu_seconds"]
     assert run == repeated == json.loads(json.dumps(run))
-
-
-@pytest.mark.parametrize(("raw_density", "opaque"), [(-10.0, 0.0), (10.0, 1.0)])
-def test_a_panel_shows_the_view_the_rendering_and_the_opacity(
-    tmp_path: Path, raw_density: float, opaque: float
-) -> None:
-    model, pictures = constant_model(raw_density, Setting(background="green"), tmp_path)
-    view, rendering, opacity = np.split(panel(model, pictures[0]), 3, axis=1)
-    alpha, green = pictures[0].image[..., 3], np.array(COLORS["green"])
-    assert np.abs(view - green)[alpha == 1].max() > 0.2
-    np.testing.assert_allclose(view[alpha == 0], np.broadcast_to(green, ((alpha == 0).sum(), 3)), atol=1e-6)
-    np.testing.assert_allclose(opacity, np.full_like(opacity, opaque), atol=1e-6)
-    assert np.allclose(rendering, green, atol=1e-6) == (not opaque)
 
 
 # -- the report
@@ -253,9 +228,7 @@ def test_the_command_trains_and_reports_a_small_sweep(
     flags = ["--settings", "base", "off centre", "--strategies", "vanilla-nerf", "adaptive", "--seeds", 0]
     answer = edge_se("bench", "stability", "--output-dir", out, "--workplace", tmp_path / "w", *flags)
     assert answer.code == 0, answer
-    assert {path.name for path in out.iterdir()} == {
-        "result.json", "README.md", "failure-rates.png", "over-time.png", "failures.png",
-    }  # fmt: skip
+    assert {path.name for path in out.iterdir()} == {"result.json", "README.md", "failure-rates.png", "over-time.png"}
     runs = json.loads((out / "result.json").read_text())["runs"]
     assert [(run["setting"], run["strategy"]) for run in runs] == [
         ("base", "adaptive"), ("base", "vanilla-nerf"), ("off centre", "adaptive"), ("off centre", "vanilla-nerf"),

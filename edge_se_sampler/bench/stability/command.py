@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 from edge_se_sampler.bench.command import ExperimentCommand
@@ -26,11 +27,13 @@ class BenchStability(ExperimentCommand):
 
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.runner import Experiment
-        from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, list_all_trials
+        from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Trial
         from edge_se_sampler.bench.stability.train import TrainingSize, run_trial
 
         check_known("settings", self.settings, SETTINGS)
         check_known("strategies", self.strategies, STRATEGIES)
-        trials = list_all_trials(self.settings or SETTINGS, self.strategies or STRATEGIES, self.seeds)
-        size, views = TrainingSize(), (self.workplace / "stability" / "views").resolve()
-        return Experiment("stability", size, lambda _: trials, run_trial, lambda _: (size, views))
+        # seed by seed, so that an unfinished sweep covers all settings and strategies
+        every = product(self.seeds, self.settings or SETTINGS, self.strategies or STRATEGIES)
+        trials = [Trial(setting, strategy, seed) for seed, setting, strategy in every]
+        size = TrainingSize()
+        return Experiment("stability", size, lambda _: trials, run_trial, lambda _: (size,))

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 
 from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Trial
+from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
 from edge_se_sampler.bench.tables import describe_command, markdown_table
 from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_axes
@@ -49,13 +47,12 @@ def describe(folder: Path) -> str:
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
-    """Draw the pictures; that of failed renderings only from views in the workplace."""
+    """Draw the pictures; none needs the workplace."""
+    del workplace
     runs = read_result(folder / "result.json")["runs"]
     if runs:
         save_figure(draw_failure_rates(count_failure_modes(runs)), folder / "failure-rates.png")
         save_figure(draw_over_time(runs), folder / "over-time.png")
-    if workplace is not None and (panels := _find_panels(runs, workplace / "stability" / "views")):
-        save_figure(draw_failures(panels), folder / "failures.png")
 
 
 def count_failure_modes(runs: Sequence[Run]) -> dict[str, dict[str, Modes]]:
@@ -143,37 +140,5 @@ def draw_over_time(runs: Sequence[Run]) -> Any:
     axis.set(xlabel="% of the iterations", ylabel="% of trainings that show the object", xlim=(0, 100), ylim=(0, 102))
     style_axes(axis)
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-    figure.tight_layout()
-    return figure
-
-
-def _find_panels(runs: Sequence[Run], views: Path, count: int = 4) -> dict[str, list[tuple[Trial, Path]]]:
-    """Failure mode and how often it occurred -> some of its trainings, with the PNG of each one's `panel`."""
-    panels = {}
-    for mode in FAILURE_MODES:
-        trials = [Trial(run["setting"], run["strategy"], run["seed"]) for run in runs if run["failure_mode"] == mode]
-        found = [(trial, path) for trial in trials if (path := views / f"{trial.name}.png").exists()]
-        spread = np.linspace(0, len(found) - 1, min(count, len(found))).round().astype(int)
-        if found:
-            panels[f"{mode}\n({len(trials)} trainings)"] = [found[i] for i in spread]
-    return panels
-
-
-def draw_failures(panels: dict[str, list[tuple[Trial, Path]]]) -> Any:
-    """A row for each failure mode, a panel for each training."""
-    rows, columns = len(panels), max(map(len, panels.values()))
-    figure, axes = require_pyplot().subplots(
-        rows, columns, figsize=(3.0 * columns, 1.5 * rows + 0.3), squeeze=False, subplot_kw={"xticks": [], "yticks": []}
-    )
-    figure.suptitle("held-out view | rendering | opacity (white: opaque)", fontsize=9)
-    for row, (label, trainings) in zip(axes, panels.items(), strict=True):
-        row[0].set_ylabel(label, fontsize=8)
-        for axis, training in zip_longest(row, trainings):
-            if training is None:
-                axis.set_visible(False)
-                continue
-            trial, path = training
-            axis.imshow(iio.imread(path), interpolation="nearest", vmin=0, vmax=255)
-            axis.set_title(f"{STRATEGIES[trial.strategy].label}\n{trial.setting}", fontsize=6.5)
     figure.tight_layout()
     return figure

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any, Literal
 
 from edge_se_sampler.bench.overrides import SAMPLER
@@ -95,10 +92,5 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """For the terminal and for files."""
-        return re.sub(r"\W+", "-", f"{self.setting} {self.strategy} {self.seed}")
-
-
-def list_all_trials(settings: Iterable[str], strategies: Iterable[str], seeds: Iterable[int]) -> list[Trial]:
-    """Every setting with every strategy, seed by seed, so that an unfinished sweep covers all of them."""
-    return [Trial(setting, strategy, seed) for seed, setting, strategy in product(seeds, settings, strategies)]
+        """For the terminal."""
+        return f"{self.setting}: {self.strategy}, seed {self.seed}"

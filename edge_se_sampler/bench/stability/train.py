@@ -10,14 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
 from edge_se_sampler.bench.outcomes import Outcome, classify
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, override
 from edge_se_sampler.bench.stability.scenes import COLORS, NUM_TRAIN, background_of, render_splits
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Setting, Trial
-from edge_se_sampler.engine.files import png_bytes, write_atomically
 from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
@@ -75,8 +73,8 @@ class Rendered:
         return "opaque background" if self.accumulation > 0.5 else "emptied"
 
 
-def run_trial(trial: Trial, size: TrainingSize, views_folder: Path) -> dict[str, Any]:
-    """Train once; called in a process of its own. If the training fails, its `panel` goes to views_folder.
+def run_trial(trial: Trial, size: TrainingSize) -> dict[str, Any]:
+    """Train once; called in a process of its own.
 
     Returns:
         outcome and failure_mode of the fine network and coarse_failure_mode; what both networks render
@@ -97,9 +95,6 @@ def run_trial(trial: Trial, size: TrainingSize, views_folder: Path) -> dict[str,
         resets = trainer.dead_network_reset
     rendered = render_networks(model, pictures)
     modes = {network: result.failure_mode(network in dead) for network, result in rendered.items()}
-    if modes["fine"] is not None:
-        views_folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(views_folder / f"{trial.name}.png", png_bytes(panel(model, pictures[0])))
     run: dict[str, Any] = {
         "outcome": rendered["fine"].outcome,
         "failure_mode": modes["fine"],
@@ -144,15 +139,6 @@ def build_trainer(
     pipeline = Pipeline(datamanager, build_model(config, "cpu"))
     pipeline.model.background_fn = background_of(setting.background)
     return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), to_pictures(test)
-
-
-def panel(model: NeRFModel, picture: Picture) -> np.ndarray:
-    """A held-out view, what the fine network renders of it, and its opacity, side by side: (H, 3 W, 3) in [0, 1]."""
-    height, width, channels = picture.image.shape
-    outputs = render_outputs(model, picture.rays(model.device), ("background", "rgb_fine", "accumulation_fine"))
-    truth = target_colors(torch.from_numpy(picture.image).reshape(-1, channels), outputs.pop("background"))
-    images = [image.expand(-1, 3).reshape(height, width, 3) for image in (truth, *outputs.values())]
-    return torch.cat(images, dim=1).clamp(0, 1).numpy()
 
 
 def render_networks(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict[str, Rendered]:
