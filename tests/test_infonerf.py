@@ -19,8 +19,8 @@ from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.data.synthetic.cameras import poses
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs

@@ -12,7 +12,7 @@ from tiny import tiny_views
 
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.resolve import resolve_config
+from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import NeRFModelConfig
 

@@ -17,8 +17,8 @@ from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-import re
 from pathlib import Path
 from typing import Any
 
@@ -20,41 +19,31 @@ from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 MAGIC = b"edge-se-checkpoint 2 "
-_NAME = re.compile(r"step-(\d{9,})\.ckpt")
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
-    """Write the checkpoint after a step (0, 1, ...), then delete the older ones.
-
-    Raises:
-        InputError: it cannot be written (disk full, no permission); older ones are untouched.
-    """
+    """Write the checkpoint after a step (0, 1, ...), then delete the older ones; InputError if it cannot be written."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
     path = folder / f"step-{step:09d}.ckpt"
     write_atomically(path, MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
-    for other_step, other in _checkpoints(folder).items():
-        if other_step < step:
+    for other in folder.glob("step-*.ckpt"):
+        if _step_of(other) < step:
             other.unlink(missing_ok=True)
     return path
 
 
 def latest_checkpoint(folder: Path) -> Path:
     """The checkpoint with the highest step; InputError if there is none."""
-    found = _checkpoints(folder)
-    if not found:
+    latest = max(folder.glob("step-*.ckpt"), key=_step_of, default=None)
+    if latest is None:
         raise InputError(f"{folder}: no checkpoint (step-*.ckpt); the run ended before its first was saved")
-    return found[max(found)]
+    return latest
 
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
-    """Read a checkpoint, and check that it is undamaged and of this configuration.
-
-    Raises:
-        InputError: unreadable, truncated or changed since it was written, not a checkpoint, or saved under another
-            configuration.
-    """
+    """Read a checkpoint; InputError if it is unreadable, damaged, none, or saved under another configuration."""
     with os_errors_as_input_errors(f"{path}: cannot be read"):
         content = path.read_bytes()
     header, _, payload = content.partition(b"\n")
@@ -71,7 +60,5 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     return state
 
 
-def _checkpoints(folder: Path) -> dict[int, Path]:
-    """Step -> checkpoint."""
-    matches = {path: _NAME.fullmatch(path.name) for path in folder.glob("step-*.ckpt")}
-    return {int(match[1]): path for path, match in matches.items() if match}
+def _step_of(checkpoint: Path) -> int:
+    return int(checkpoint.stem.removeprefix("step-"))

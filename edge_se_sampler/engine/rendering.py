@@ -54,11 +54,7 @@ def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torc
 
 
 def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
-    """A view's rendering (H, W, 3) in [0, 1] and its PSNR.
-
-    Raises:
-        FloatingPointError: a rendered value is not finite.
-    """
+    """A view's rendering (H, W, 3) in [0, 1] and its PSNR; FloatingPointError if a rendered value is not finite."""
     height, width = picture.image.shape[:2]
     rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
     if not np.isfinite(rendered).all():

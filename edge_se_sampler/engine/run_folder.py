@@ -14,17 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import write_atomically, write_image, write_json
+from edge_se_sampler.engine.files import write_atomically, write_json
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """One run on the disk."""
-
     path: Path
 
     @classmethod
@@ -41,15 +37,10 @@ class RunFolder:
 
     @property
     def checkpoints(self) -> Path:
-        """Folder of the checkpoints."""
         return self.path / "checkpoints"
 
     def config(self, method_configs: Mapping[str, TrainerConfig]) -> TrainerConfig:
-        """The run's settings, of the same types as its method's defaults.
-
-        Raises:
-            InputError: no run folder, or its config.json is broken or of another version.
-        """
+        """The run's settings, typed as its method's defaults; InputError if there are none of this version."""
         path = self.path / "config.json"
         if not self.path.is_dir():
             raise InputError(f"{self.path}: no such run folder; edge-se train prints where a run lands")
@@ -89,10 +80,6 @@ class RunFolder:
         kept = [json.dumps(line) + "\n" for line in self.metrics() if line["step"] <= step]
         write_atomically(self.path / "metrics.jsonl", "".join(kept).encode())
 
-    def save_preview(self, step: int, image: np.ndarray) -> None:
-        """Save the (H, W, 3) float preview, in [0, 1], of a step."""
-        write_image(self.path / "previews" / f"step-{step:09d}.png", image)
-
 
 def _new_folder(parent: Path, name: str) -> Path:
     """Create parent/name, or the first of name-1, name-2, ... that does not exist."""
@@ -119,10 +106,7 @@ def config_digest(config: TrainerConfig) -> str:
 
 
 def config_from_json(default: Any, values: Any, where: str) -> Any:
-    """The (nested) config dataclass that `config_to_json` turned into these values.
-
-    InputError if fields are missing, unknown or of another type.
-    """
+    """What `config_to_json` made these values of; InputError if fields are missing, unknown or of another type."""
     fields = {field.name: field for field in dataclasses.fields(default)}
     if not isinstance(values, dict) or set(values) != set(fields):
         differing = sorted(set(values) ^ set(fields)) if isinstance(values, dict) else "not an object"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,25 +18,21 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import to_pictures
-from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.config import NeRFModelConfig, apply_preset, decide_size
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: OccupancyGrid | None = None) -> Trainer:
-    """Read the data, resolve the config, and set up a trainer.
+    """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
 
     Args:
         run: the folder of a run to continue; by default a new one.
         grid: the occupancy grid in that run's checkpoint; by default the scene's.
-
-    Raises:
-        InputError: bad data or settings; nothing is written then.
     """
     views, device = read_train_views(config), choose_device(config.machine.device_type)
     held_out = _read_first_split(config, ("val", "test"))
@@ -47,13 +43,33 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: Occupancy
     return config.setup(run=run or RunFolder.create(config), pipeline=pipeline, preview=preview)
 
 
-def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
-    """Continue an interrupted run under its own settings (`run.config`); max_seconds holds for this session.
+def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
+    """The config with nothing left open, its size decided by the training views; a resolved one stays as it is,
+    whatever the views. InputError if a value is out of its range."""
+    data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
+    config = replace(config, pipeline=replace(config.pipeline, model=model))
+    preset = config.preset
+    resolved = replace(
+        config,
+        data=data,
+        experiment_name=config.experiment_name or (data.name if data else "unnamed"),
+        max_num_iterations=preset.iterations,
+        steps_per_eval_image=config.preview_interval,
+        pipeline=replace(
+            config.pipeline,
+            datamanager=replace(config.pipeline.datamanager, train_num_rays_per_batch=preset.rays),
+            model=apply_preset(model, preset.rays),
+        ),
+        optimizer=replace(config.optimizer, lr=preset.learning_rate),
+    )
+    resolved.check()
+    return resolved
 
-    Raises:
-        InputError: no such run, no or bad checkpoint, or its data is gone or has changed.
-    """
-    config = dataclasses.replace(config, max_seconds=max_seconds)
+
+def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
+    """Continue an interrupted run under its own settings (`run.config`), but for max_seconds.
+    InputError if its checkpoint is bad, or its data is gone or has changed."""
+    config = replace(config, max_seconds=max_seconds)
     config.check()
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
     trainer = prepare(config, run, saved_grid(state["model"]))
@@ -88,11 +104,7 @@ def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views |
 
 
 def read_train_views(config: TrainerConfig) -> Views:
-    """The training views of a config's data: all, or those of --num-views or --views.
-
-    Raises:
-        InputError: no data given, bad data, or a selection that does not fit it.
-    """
+    """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
     if config.data is None:
         raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
     views = read_blender(config.data, "train")

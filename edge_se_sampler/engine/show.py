@@ -30,15 +30,8 @@ def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np
 
 
 def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Path, num_views: int, seed: int) -> None:
-    """Draw num_views of the training views, evenly spaced, and write the figure as PNG.
-
-    Args:
-        config: the sampler's; num_rays_per_batch pixels are drawn from each view.
-        strategy: "uniform", "precrop" or "edge".
-
-    Raises:
-        InputError: matplotlib is missing, or the settings do not fit the images.
-    """
+    """Draw num_views of the training views, evenly spaced, with num_rays_per_batch drawn pixels each, as a PNG.
+    InputError if matplotlib is missing, or the settings do not fit the images."""
     pyplot = require_pyplot()
     config.check()
     distribution = DISTRIBUTIONS[strategy](config)

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
+from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.pipeline import Pipeline, load_weights
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
@@ -167,7 +168,7 @@ class Trainer:
         if self.preview_picture is not None:
             rendered, self._preview_psnr = render_view(self.pipeline.model, self.preview_picture)
             self._record(step, val_psnr=self._preview_psnr)
-            self.run.save_preview(step, rendered)
+            write_image(self.run.path / "previews" / f"step-{step:09d}.png", rendered)
 
     def _status(self, loss: float) -> str:
         rate = self.next_step * self.config.preset.rays / self.elapsed

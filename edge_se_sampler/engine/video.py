@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from edge_se_sampler.engine.camera_path import spiral
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
 from edge_se_sampler.engine.progress import Progress
@@ -17,6 +19,19 @@ from edge_se_sampler.engine.rendering import render_rays
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_test_views, read_train_views
 from edge_se_sampler.errors import InputError, check_value
+
+
+def spiral(like: Cameras, count: int) -> Cameras:
+    """Cameras once around the origin at the median distance of `like`, rising and falling between 15 and 45 degrees,
+    with the first one's intrinsics and size."""
+    radius = float(like.camera_to_worlds[:, :, 3].norm(dim=1).median())
+    azimuth = torch.arange(count).to(like.fx) / count * 2 * math.pi
+    elevation = math.radians(30) + math.radians(15) * torch.sin(2 * azimuth)
+    horizontal = elevation.cos()
+    back = torch.stack((horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()), dim=1)  # unit vectors
+    right = torch.stack((-azimuth.sin(), azimuth.cos(), torch.zeros_like(azimuth)), dim=1)
+    poses = torch.stack((right, torch.linalg.cross(back, right), back, back * radius), dim=2)
+    return replace(like[[0] * count], camera_to_worlds=poses)
 
 
 def render_run(
@@ -58,10 +73,7 @@ def check_video(path: Path, frames_per_second: int) -> None:
 
 def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) -> None:
     """Write (H, W, 3) float frames in [0, 1]; a GIF shows each for the nearest number of hundredths of a second.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    InputError if it cannot be written."""
     stacked, suffix = to_uint8(np.stack(frames)), path.suffix.lower()
     if suffix == ".gif":
         settings: dict[str, Any] = {"duration": 10 * round(100 / frames_per_second), "loop": 0}

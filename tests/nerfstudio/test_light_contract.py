@@ -42,8 +42,8 @@ from edge_se_sampler.data.config import VanillaDataManagerConfig  # noqa: E402
 from edge_se_sampler.data.views import Views  # noqa: E402
 from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig  # noqa: E402
 from edge_se_sampler.engine.pipeline import Pipeline  # noqa: E402
-from edge_se_sampler.engine.resolve import resolve_config  # noqa: E402
 from edge_se_sampler.engine.run_folder import RunFolder  # noqa: E402
+from edge_se_sampler.engine.session import resolve_config  # noqa: E402
 from edge_se_sampler.engine.trainer import Trainer  # noqa: E402
 from edge_se_sampler.errors import InputError  # noqa: E402
 from edge_se_sampler.methods import STRATEGIES  # noqa: E402

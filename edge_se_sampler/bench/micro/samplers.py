@@ -17,8 +17,8 @@ from edge_se_sampler.bench.timing import median_milliseconds
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.pipeline import Pipeline
-from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.edges import edge_strength

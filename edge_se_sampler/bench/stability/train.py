@@ -20,9 +20,8 @@ from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.rendering import Picture, render_outputs, to_pictures
-from edge_se_sampler.engine.resolve import resolve_config
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import disable_malloc_trimming
+from edge_se_sampler.engine.session import disable_malloc_trimming, resolve_config
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.nerf import NeRFModel

@@ -25,9 +25,30 @@ def bricks(scene: SceneBuilder) -> None:
     _brick(scene, (0, 0, -0.62), (18, 12, 0.02), GREEN)
     for y in (-0.36, 0.36):
         _track(scene, y)
-    _body(scene)
-    _cab(scene)
-    _blade(scene)
+    # body
+    _brick(scene, (-0.1, 0, -0.26), (8, 5, 0.05), YELLOW, studs=False)
+    _brick(scene, (-0.3, 0, -0.16), (5, 5, 0.05), GRAY)
+    _brick(scene, (0.2, 0, -0.14), (4, 4, 0.07), YELLOW)
+    _brick(scene, (-0.35, 0, 0.02), (4, 5, 0.05), YELLOW, studs=False)
+    _brick(scene, (-0.72, 0, -0.2), (2, 3, 0.08), DARK)
+    for y in (-0.12, 0.12):
+        scene.tube((0.2, y, -0.05), (0.2, y, 0.2), 0.035, DARK)
+    # cab
+    for x in (-0.52, -0.18):
+        for y in (-0.22, 0.22):
+            scene.tube((x, y, 0.06), (x, y, 0.42), 0.02, DARK)
+    scene.box((-0.35, 0, 0.22), (0.16, 0.2, 0.13), GLASS)
+    _brick(scene, (-0.35, 0, 0.46), (5, 6, 0.04), YELLOW)
+    scene.tube((-0.5, -0.15, 0.5), (-0.5, -0.15, 0.68), 0.025, RED)
+    scene.sphere((-0.5, -0.15, 0.7), 0.035, GLASS)
+    # blade
+    for y in (-0.3, 0.3):
+        scene.box((0.42, y, -0.33), (0.32, 0.025, 0.035), GRAY, rotation((0, 1, 0), -8))
+        scene.tube((0.15, y, -0.12), (0.68, y, -0.26), 0.022, RED)
+    for degrees in (-28, -10, 10, 28):
+        angle = math.radians(degrees)
+        center = (0.86 - 0.12 * math.cos(angle), 0, -0.36 + 0.33 * math.sin(angle))
+        scene.box(center, (0.025, 0.52, 0.085), WARNING, rotation((0, 1, 0), -degrees))
 
 
 def _brick(
@@ -53,33 +74,3 @@ def _track(scene: SceneBuilder, y: float) -> None:
         for side, x in ((1, 0.28), (-1, -0.53)):
             tilt = rotation((0, 1, 0), -side * degrees)
             scene.box((x + side * out, y, -0.45 + up), (0.018, 0.13, 0.035), DARK, tilt)
-
-
-def _body(scene: SceneBuilder) -> None:
-    _brick(scene, (-0.1, 0, -0.26), (8, 5, 0.05), YELLOW, studs=False)
-    _brick(scene, (-0.3, 0, -0.16), (5, 5, 0.05), GRAY)
-    _brick(scene, (0.2, 0, -0.14), (4, 4, 0.07), YELLOW)
-    _brick(scene, (-0.35, 0, 0.02), (4, 5, 0.05), YELLOW, studs=False)
-    _brick(scene, (-0.72, 0, -0.2), (2, 3, 0.08), DARK)
-    for y in (-0.12, 0.12):
-        scene.tube((0.2, y, -0.05), (0.2, y, 0.2), 0.035, DARK)
-
-
-def _cab(scene: SceneBuilder) -> None:
-    for x in (-0.52, -0.18):
-        for y in (-0.22, 0.22):
-            scene.tube((x, y, 0.06), (x, y, 0.42), 0.02, DARK)
-    scene.box((-0.35, 0, 0.22), (0.16, 0.2, 0.13), GLASS)
-    _brick(scene, (-0.35, 0, 0.46), (5, 6, 0.04), YELLOW)
-    scene.tube((-0.5, -0.15, 0.5), (-0.5, -0.15, 0.68), 0.025, RED)
-    scene.sphere((-0.5, -0.15, 0.7), 0.035, GLASS)
-
-
-def _blade(scene: SceneBuilder) -> None:
-    for y in (-0.3, 0.3):
-        scene.box((0.42, y, -0.33), (0.32, 0.025, 0.035), GRAY, rotation((0, 1, 0), -8))
-        scene.tube((0.15, y, -0.12), (0.68, y, -0.26), 0.022, RED)
-    for degrees in (-28, -10, 10, 28):
-        angle = math.radians(degrees)
-        center = (0.86 - 0.12 * math.cos(angle), 0, -0.36 + 0.33 * math.sin(angle))
-        scene.box(center, (0.025, 0.52, 0.085), WARNING, rotation((0, 1, 0), -degrees))

@@ -12,21 +12,14 @@ TUFT = Material((0.8, 0.7, 0.4), roughness=0.6)
 
 
 def chair(scene: SceneBuilder) -> None:
-    _seat_and_legs(scene)
-    _frame(scene)
-    _back(scene)
-
-
-def _seat_and_legs(scene: SceneBuilder) -> None:
+    # seat and legs
     scene.box((0, 0, -0.12), (0.55, 0.52, 0.05), WOOD)
     scene.sphere((0, 0, -0.04), (0.52, 0.49, 0.13), CLOTH)
     for x in (-0.5, 0.5):
         for y in (-0.46, 0.46):
             scene.tube((x, y, -0.17), (1.12 * x, 1.12 * y, -0.95), 0.06, WOOD, end_radius=0.035)
             scene.sphere((1.12 * x, 1.12 * y, -0.96), 0.045, GOLD)
-
-
-def _frame(scene: SceneBuilder) -> None:
+    # posts and arms
     for x in (-0.5, 0.5):
         post = [(x, 0.47, -0.12), (x, 0.55, 0.4), (0.95 * x, 0.66, 0.95)]
         scene.polyline(post, 0.045, WOOD)
@@ -34,9 +27,7 @@ def _frame(scene: SceneBuilder) -> None:
         arm = [(x, -0.42, -0.1), (1.08 * x, -0.44, 0.22), (1.08 * x, 0, 0.28), (x, 0.53, 0.3)]
         scene.polyline(arm, 0.035, WOOD)
         scene.sphere((1.08 * x, -0.46, 0.23), 0.06, WOOD)
-
-
-def _back(scene: SceneBuilder) -> None:
+    # back
     for y, z in ((0.54, 0.25), (0.65, 0.9)):
         scene.tube((-0.5, y, z), (0.5, y, z), 0.035, WOOD)
     for k in range(9):

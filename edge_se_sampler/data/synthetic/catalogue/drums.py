@@ -36,7 +36,12 @@ def drums(scene: SceneBuilder) -> None:
     _cymbal(scene, (-1.0, -0.1, 0.25), 0.24, 4, (-1.0, -0.1, FLOOR))
     scene.tube((-1.0, -0.1, 0.28), (-1.0, -0.1, 0.31), 0.24, BRASS, end_radius=0.06)
 
-    _stool(scene)
+    # stool and sticks
+    scene.tube((0, -0.75, -0.3), (0, -0.75, -0.2), 0.2, BLACK)
+    scene.tube((0, -0.75, -0.3), (0, -0.75, FLOOR), 0.02, CHROME)
+    for k in range(3):
+        foot = vector([0, -0.75, 0]) + around(0.22, 2.1 * k, FLOOR)
+        scene.tube((0, -0.75, -0.6), foot, 0.014, CHROME)
     scene.tube((-0.8, -0.5, 0), (-0.45, -0.25, 0.04), 0.009, STICK)
     scene.tube((-0.6, -0.52, 0), (-0.7, -0.2, 0.04), 0.009, STICK)
 
@@ -69,11 +74,3 @@ def _cymbal(
     for k in range(3):
         leg = vector(foot) + around(0.2, 2.1 * k + 0.3)
         scene.tube((foot[0], foot[1], foot[2] + 0.25), leg, 0.01, CHROME)
-
-
-def _stool(scene: SceneBuilder) -> None:
-    axis = vector([0, -0.75, 0])
-    scene.tube((0, -0.75, -0.3), (0, -0.75, -0.2), 0.2, BLACK)
-    scene.tube((0, -0.75, -0.3), (0, -0.75, FLOOR), 0.02, CHROME)
-    for k in range(3):
-        scene.tube((0, -0.75, -0.6), axis + around(0.22, 2.1 * k, FLOOR), 0.014, CHROME)

@@ -38,33 +38,25 @@ class _Tree:
         """A branch of three pieces; then leaves on it, or `generations` of thinner branches."""
         points = [start]
         for _ in range(3):
-            direction = unit(direction + 0.22 * self._normal() + vector([0, 0, 0.08]))
+            direction = unit(direction + 0.22 * self.random.randn(3) + vector([0, 0, 0.08]))
             points.append(points[-1] + direction * size / 3)
         self.scene.polyline(points, radius, BARK)
         if generations == 0:
-            self._leaf_out(points[1:], direction)
+            for point in np.repeat(points[1:], 3, axis=0):
+                aside = unit(self.random.randn(3) * vector([1, 1, 0.6]))
+                self._leaf(point, unit(aside + 0.4 * direction))
             return
         for k in range(3 if generations > 1 else 2 + self.random.randint(2)):
-            aside = self._normal()
+            aside = self.random.randn(3)
             aside = unit(aside - dot(aside, direction) * direction)
             outward = 0.75 * direction + 0.8 * aside
             self.grow(points[-1 - k % 2], outward, 0.62 * size, 0.6 * radius, generations - 1)
 
-    def _leaf_out(self, points: list[Array], direction: Array) -> None:
-        for point in points:
-            for _ in range(3):
-                aside = self._normal() * vector([1, 1, 0.6])
-                self._leaf(point, unit(unit(aside) + 0.4 * direction))
-
     def _leaf(self, stem: Array, along: Array) -> None:
-        face = vector([0, 0, 1]) + 0.7 * self._normal()
+        face = vector([0, 0, 1]) + 0.7 * self.random.randn(3)
         face = unit(face - dot(face, along) * along)
         half = 0.075 + 0.05 * self.random.rand()
         rotation = np.stack([along, cross(face, along), face], axis=1)
         material = LEAVES[self.random.randint(3)]
         self.scene.sphere(stem + (half + 0.03) * along, (half, 0.42 * half, 0.006), material, rotation)
         self.scene.tube(stem, stem + 0.05 * along, 0.004, BARK)
-
-    def _normal(self) -> Array:
-        """Three draws of a standard normal."""
-        return self.random.randn(3)

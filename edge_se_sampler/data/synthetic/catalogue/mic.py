@@ -20,17 +20,12 @@ CAGE = 0.27  # radius
 FLOOR = -1.08
 
 
-def mic(scene: SceneBuilder) -> None:
-    _cage(scene)
-    _handle(scene)
-    _stand(scene)
-
-
 def _to_world(point: ArrayLike) -> Array:
     return apply(TILT, vector(point)) + HEAD
 
 
-def _cage(scene: SceneBuilder) -> None:
+def mic(scene: SceneBuilder) -> None:
+    # cage
     circle = [2 * math.pi * k / 24 for k in range(25)]
     for k in range(9):
         azimuth = math.pi * k / 9
@@ -42,9 +37,7 @@ def _cage(scene: SceneBuilder) -> None:
         scene.polyline([_to_world(p) for p in parallel], 0.007, STEEL, joints=False)
     scene.tube(_to_world((0, 0, -0.025)), _to_world((0, 0, 0.025)), 0.283, STEEL)
     scene.sphere(HEAD, 0.17, FOAM)
-
-
-def _handle(scene: SceneBuilder) -> None:
+    # handle
     scene.tube(_to_world((0, 0, -0.9)), _to_world((0, 0, -0.24)), 0.085, DARK, end_radius=0.15)
     scene.tube(_to_world((0, 0, -0.27)), _to_world((0, 0, -0.22)), 0.165, STEEL)
     scene.tube(_to_world((0, 0, -0.95)), _to_world((0, 0, -0.9)), 0.07, STEEL)
@@ -54,9 +47,7 @@ def _handle(scene: SceneBuilder) -> None:
         for t in spaced(0, 1, 14)
     ]
     scene.polyline(cable, 0.016, DARK)
-
-
-def _stand(scene: SceneBuilder) -> None:
+    # stand
     scene.tube(_to_world((0, 0, -0.68)), _to_world((0, 0, -0.56)), 0.125, STEEL)
     clamp = _to_world((0, 0, -0.62))
     x, _, z = clamp.tolist()
