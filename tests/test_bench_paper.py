@@ -15,8 +15,7 @@ import pytest
 
 from edge_se_sampler.bench import runner
 from edge_se_sampler.bench.paper.published import SCENES, published
-from edge_se_sampler.bench.paper.scenes import check_data, real_scene
-from edge_se_sampler.bench.paper.tables import psnr_table
+from edge_se_sampler.bench.paper.report import psnr_table
 from edge_se_sampler.bench.paper.trials import (
     PAPER_TABLES,
     PRESETS,
@@ -24,7 +23,9 @@ from edge_se_sampler.bench.paper.trials import (
     Settings,
     Trial,
     build_config,
+    check_data,
     list_trials,
+    real_scene,
     run_trial,
     synthetic_scene,
 )

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from string import Formatter
 from typing import Any
 
-from edge_se_sampler.bench.tables import fill_markers
 from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 REPORTS = ("chart", "paper", "stability", "schedule", "nerfstudio", "micro", "demo")
 """Experiments, each a package with a module `report`."""
@@ -21,7 +21,8 @@ REPORTS = ("chart", "paper", "stability", "schedule", "nerfstudio", "micro", "de
 def report_of(folder: Path) -> Any:
     """The module that reports a folder: `describe(folder)` is its README.md, a function of the json files and of which
     pictures there are. Optional: `draw(folder, workplace)` draws the pictures, those that need renderings only where
-    the workplace has them; `tables(folder)` are tables by name that other texts show.
+    the workplace has them; `tables(folder)` are tables by name that other texts show. All raise InputError if the
+    result cannot be read or a picture cannot be written.
 
     Raises:
         InputError: no result lies there.
@@ -51,7 +52,23 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
         report.draw(folder, workplace)
     write_atomically(folder / "README.md", report.describe(folder).encode())
     if readme is not None:
-        fill_markers(readme, report.tables(folder) if hasattr(report, "tables") else {})
+        _fill_markers(readme, report.tables(folder) if hasattr(report, "tables") else {})
+
+
+def _fill_markers(path: Path, tables: Mapping[str, str]) -> None:
+    """Replace what a text has between `<!-- table: NAME -->` and `<!-- end -->` by the tables of those names.
+
+    Raises:
+        InputError: the file cannot be read or written, or lacks a marker.
+    """
+    with os_errors_as_input_errors(f"{path}: cannot be read"):
+        text = path.read_text(encoding="utf-8")
+    for name, table in tables.items():
+        pattern = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if not pattern.search(text):
+            raise InputError(f"{path}: has no marker <!-- table: {name} --> ... <!-- end -->")
+        text = pattern.sub(lambda found, new=table: f"{found[1]}{new}\n{found[2]}", text)
+    write_atomically(path, text.encode())
 
 
 def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:

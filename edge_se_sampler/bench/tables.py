@@ -1,14 +1,9 @@
-"""Markdown tables of reports, and the texts between markers that reports fill in."""
+"""What reports are written with: Markdown tables, numbers, commands and machines."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.errors import InputError
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -17,9 +12,9 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
 
 
-def decimals(value: float | None, digits: int = 2) -> str:
-    """A number, or a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}f}"
+def decimals(value: float | None) -> str:
+    """A number with two decimals, or a dash where there is none."""
+    return "–" if value is None else f"{value:.2f}"
 
 
 def describe_machine(machine: Mapping[str, Any]) -> str:
@@ -38,21 +33,3 @@ def describe_command(*results: Mapping[str, Any]) -> str:
         f"```bash\n{commands}\n```\n\n{cost}A command that was stopped goes on where it was. `edge-se bench report` "
         f"with this folder writes this page again.\n\nMeasured on: {describe_machine(results[-1]['machine'])}."
     )
-
-
-def fill_markers(path: Path, tables: Mapping[str, str]) -> None:
-    """Replace what a text has between `<!-- table: NAME -->` and `<!-- end -->` by the tables of those names.
-
-    Raises:
-        InputError: the file cannot be read or written, or lacks a marker.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as problem:
-        raise InputError(f"{path}: cannot be read ({problem.strerror})") from problem
-    for name, table in tables.items():
-        pattern = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-        if not pattern.search(text):
-            raise InputError(f"{path}: has no marker <!-- table: {name} --> ... <!-- end -->")
-        text = pattern.sub(lambda found, new=table: f"{found[1]}{new}\n{found[2]}", text)
-    write_atomically(path, text.encode())

@@ -29,29 +29,27 @@ class BenchPaper(ExperimentCommand):
     """Of the paper's six, under the methods' names; none: all."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.paper.published import SCENES
-        from edge_se_sampler.bench.paper.scenes import check_data, real_scene
-        from edge_se_sampler.bench.paper.trials import PRESETS, TABLES, Trial, list_trials, run_trial, synthetic_scene
+        from edge_se_sampler.bench.paper import trials as paper
         from edge_se_sampler.bench.runner import Experiment
-        from edge_se_sampler.bench.strategies import LABELS
 
-        check_known("tables", self.tables, TABLES)
-        check_known("scenes", self.scenes, SCENES)
-        check_known("strategies", self.strategies, LABELS)
+        check_known("tables", self.tables, paper.TABLES)
+        check_known("scenes", self.scenes, paper.SCENES)
+        check_known("strategies", self.strategies, paper.LABELS)
         if (self.data is None) != (self.preset == "cpu"):
             raise InputError("--preset paper needs --data, a NeRF-synthetic folder; --preset cpu renders its scenes")
-        settings = PRESETS[self.preset]
-        trials = list_trials(self.tables, self.scenes, self.strategies, self.seeds)
+        trials = paper.list_trials(self.tables, self.scenes, self.strategies, self.seeds)
         if not trials:
             raise InputError("--tables and --strategies: no chosen table has a chosen strategy")
         if self.data is not None:
-            check_data(self.data, self.scenes or SCENES)
+            paper.check_data(self.data, self.scenes or paper.SCENES)
+        settings = paper.PRESETS[self.preset]
 
-        def arguments(trial: Trial) -> tuple[object, ...]:
+        def arguments(trial: paper.Trial) -> tuple[object, ...]:
             if self.data is None:
-                data = synthetic_scene(trial.table, trial.scene, settings, self.workplace)
+                data = paper.synthetic_scene(trial.table, trial.scene, settings, self.workplace)
             else:
-                data = real_scene(self.data, trial.scene, TABLES[trial.table].placement, self.workplace)
+                placement = paper.TABLES[trial.table].placement
+                data = paper.real_scene(self.data, trial.scene, placement, self.workplace)
             return settings, data, self.workplace
 
-        return Experiment("paper", settings, lambda _: trials, run_trial, arguments)
+        return Experiment("paper", settings, lambda _: trials, paper.run_trial, arguments)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -10,13 +10,19 @@ from typing import Any, Literal
 
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.bench.paper.published import SCENES
-from edge_se_sampler.bench.paper.scenes import save_examples
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.scenes import cached_scene
 from edge_se_sampler.bench.strategies import LABELS
 from edge_se_sampler.bench.train import train_and_measure
+from edge_se_sampler.data.blender import has_split, read_blender
+from edge_se_sampler.data.offcenter import offcenter
+from edge_se_sampler.data.synthetic import ANALOG_OF
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
+from edge_se_sampler.engine.files import write_image
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.sampling.edges import unit_float
 
 LATE_SE = ("se-nerf", "precrop-se-nerf", "edge-se-nerf")
 
@@ -119,15 +125,13 @@ def list_trials(
 ) -> list[Trial]:
     """All chosen trainings (nothing chosen: all): the paper's seed by seed, then ours, so that an unfinished experiment
     is a smaller one."""
-    chosen = tables or (*TABLES,)
-    groups = [[n for n in TABLES if n in chosen and (n in PAPER_TABLES) == papers] for papers in (True, False)]
-    return [
+    trials = [
         Trial(table, scene, strategy, seed)
-        for group in groups
-        for seed, table, scene in product(seeds, group, scenes or SCENES)
+        for seed, table, scene in product(seeds, tables or TABLES, scenes or SCENES)
         for strategy in TABLES[table].strategies
         if not strategies or strategy in strategies
     ]
+    return sorted(trials, key=lambda trial: trial.table not in PAPER_TABLES)
 
 
 def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path) -> TrainerConfig:
@@ -156,20 +160,43 @@ def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path)
 
 
 def run_trial(trial: Trial, settings: Settings, data: Path, workplace: Path) -> Run:
-    """Train a trial and measure it; its rendering of the first test view goes to workplace/paper/views."""
+    """Train a trial and measure it. Its rendering of the first test view goes to workplace/paper/views, and the scene's
+    first training and test view, where they are not there yet."""
     views = workplace / "paper" / "views"
-    save_examples(data, views, f"{TABLES[trial.table].placement}-{trial.scene}")
+    for split in ("train", "test"):
+        path = views / f"{TABLES[trial.table].placement}-{trial.scene}-{split}.png"
+        if not path.exists():
+            views.mkdir(parents=True, exist_ok=True)
+            write_image(path, unit_float(read_blender(data, split).images[0]))
     return train_and_measure(build_config(trial, settings, data, workplace / "runs"), views / f"{trial.name}.png")
 
 
 def synthetic_scene(table: int, scene: str, settings: Settings, workplace: Path) -> Path:
     """The folder of a synthetic scene as a table's trials see it, rendered where it is missing."""
-    return cached_scene(
-        workplace,
-        scene,
-        size=settings.image_size,
-        placement=TABLES[table].placement,
-        num_train=settings.num_train,
-        num_val=1,
-        num_test=settings.num_test,
-    )
+    counts = {"num_train": settings.num_train, "num_val": 1, "num_test": settings.num_test}
+    return cached_scene(workplace, scene, size=settings.image_size, placement=TABLES[table].placement, **counts)
+
+
+def real_scene(data: Path, scene: str, placement: str, workplace: Path) -> Path:
+    """A scene of a NeRF-synthetic folder; padded or shifted, it is written to workplace/scenes/offcenter at first.
+
+    Raises:
+        InputError: bad data.
+    """
+    if placement == "centered":
+        return data / ANALOG_OF[scene]
+    counterparts = workplace / "scenes" / "offcenter" / scene
+    if not counterparts.exists():
+        with Progress(0, f"moving {scene} off the centre") as progress:
+            offcenter(data / ANALOG_OF[scene], counterparts, progress=progress.update)
+    return counterparts / {"padded": "centered", "shifted": "shifted"}[placement]
+
+
+def check_data(data: Path, scenes: Iterable[str]) -> None:
+    """InputError if a NeRF-synthetic folder lacks a scene's training or test split."""
+    for scene, split in product(scenes, ("train", "test")):
+        if not has_split(data / ANALOG_OF[scene], split):
+            raise InputError(
+                f"--data {data}: {ANALOG_OF[scene]}/transforms_{split}.json is missing; a NeRF-synthetic folder "
+                "has one folder a scene (chair, drums, ficus, hotdog, lego, materials, mic); fewer: name --scenes"
+            )

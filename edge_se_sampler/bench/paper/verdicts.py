@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, Trial, runs_by_trial
@@ -27,7 +27,8 @@ WITH_SE = {SE: RANDOM, PRECROP_SE: PRECROP, EDGE_SE: EDGE}
 EDGE_AGAINST_PRECROP = {EDGE: PRECROP, EDGE_SE: PRECROP_SE}
 
 Kind = Literal["better", "not inferior", "prevents failures"]
-Verdict = Literal["supported", "not supported", "undecided", "nothing to compare"]
+Verdict = Literal["not supported", "undecided", "supported", "nothing to compare"]
+"""The worst first."""
 PSNR, EDGE_BAND = "psnr", "edge_band_psnr"
 
 
@@ -43,7 +44,6 @@ class Comparison:
 
     @property
     def label(self) -> str:
-        """In words."""
         strategies = " against ".join(dict.fromkeys(LABELS[strategy] for _, strategy in (self.arm, self.baseline)))
         tables = " against ".join(dict.fromkeys(str(table) for table, _ in (self.arm, self.baseline)))
         minus = "" if self.minus_table is None else f", minus that in table {self.minus_table}"
@@ -79,17 +79,14 @@ class ComparedRuns:
 
 @dataclass(frozen=True)
 class ClaimVerdict:
-    """What the runs say of a claim."""
+    """What the runs say of a claim: of each of its comparisons."""
 
     claim: Claim
     rows: list[ComparedRuns]
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of its comparisons'."""
-        verdicts = {row.verdict for row in self.rows}
-        ordered: tuple[Verdict, ...] = ("not supported", "undecided", "supported", "nothing to compare")
-        return next(verdict for verdict in ordered if verdict in verdicts)
+        return next(verdict for verdict in get_args(Verdict) if any(row.verdict == verdict for row in self.rows))
 
 
 def _compare_in(tables: Iterable[int], pairs: dict[str, str], **options: Any) -> list[Comparison]:
@@ -133,10 +130,9 @@ def evaluate_claims(runs: list[Run]) -> list[ClaimVerdict]:
     by_trial = runs_by_trial(runs)
     verdicts = []
     for claim in CLAIMS:
-        rows = [_compare(comparison, claim.kind, by_trial) for comparison in claim.comparisons]
-        if any(row.pairs for row in rows):
-            verdicts.append(ClaimVerdict(claim, [row for row in rows if row.pairs]))
-    return verdicts
+        compared = [_compare(comparison, claim.kind, by_trial) for comparison in claim.comparisons]
+        verdicts.append(ClaimVerdict(claim, [row for row in compared if row.pairs]))
+    return [verdict for verdict in verdicts if verdict.rows]
 
 
 def _compare(comparison: Comparison, kind: Kind, by_trial: dict[Trial, Run]) -> ComparedRuns:
@@ -150,8 +146,15 @@ def _compare(comparison: Comparison, kind: Kind, by_trial: dict[Trial, Run]) -> 
             if all(run is not None and run[comparison.measure] for run in runs):
                 pairs.append(runs)
     failures, baseline_failures = (sum(failed(runs[i]) for runs in pairs) for i in (0, 1))
-    informative = [runs for runs in pairs if not _both_failed(runs)]
-    difference = paired_difference((runs[0]["scene"], _difference(runs, comparison.measure)) for runs in informative)
+    # two failed runs show the same background: that says nothing about how good either way of sampling is
+    informative = [
+        runs for runs in pairs if not any(failed(a) and failed(b) for a, b in zip(runs[::2], runs[1::2], strict=True))
+    ]
+    signs = (1, -1, -1, 1)
+    difference = paired_difference(
+        (runs[0]["scene"], sum(sign * run[comparison.measure] for sign, run in zip(signs, runs, strict=False)))
+        for runs in informative
+    )
     if kind == "prevents failures":
         verdict = _judge_failures(pairs)
     elif not informative:
@@ -161,16 +164,6 @@ def _compare(comparison: Comparison, kind: Kind, by_trial: dict[Trial, Run]) -> 
         if kind == "not inferior" and failures > baseline_failures and verdict == "supported":
             verdict = "undecided"
     return ComparedRuns(comparison, difference, len(pairs), failures, baseline_failures, verdict)
-
-
-def _both_failed(runs: list[Run]) -> bool:
-    """Two failed runs show the same background: that says nothing about how good either way of sampling is."""
-    return any(failed(run) and failed(baseline) for run, baseline in zip(runs[::2], runs[1::2], strict=True))
-
-
-def _difference(runs: list[Run], measure: str) -> float:
-    values = [run[measure] for run in runs]
-    return values[0] - values[1] - (values[2] - values[3] if values[2:] else 0.0)
 
 
 def _judge_interval(kind: Kind, difference: PairedDifference) -> Verdict:
