@@ -90,7 +90,6 @@ class ByColumn(Distribution):
 class Brightest(Selector):
     """A custom selector: the candidates with the largest squared errors."""
 
-    name = "brightest"
     candidates_per_pixel = 3
 
     def select(self, candidates: PixelBatch, count: int, step: TrainingStep) -> PixelBatch:

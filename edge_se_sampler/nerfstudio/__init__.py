@@ -1,4 +1,1 @@
-"""The plugin for nerfstudio 1.1.5, and the only place that imports it.
-
-Not imported by anything of the standalone program: nerfstudio finds `entry_points` by itself.
-"""
+"""The plugin for nerfstudio 1.1.5, which finds its `entry_points`; the standalone program imports nothing here."""

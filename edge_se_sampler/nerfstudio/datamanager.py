@@ -30,8 +30,8 @@ class EdgeSEDataManager(VanillaDataManager):
         important = isinstance(shared, SamplingSettings)
         if important and self.config.patch_size > 1:
             raise InputError(f"patch-size is {self.config.patch_size}: this sampler draws no patches")
-        evaluation = dataset is not self.train_dataset
-        self.config.pixel_sampler = _uniform_config(shared) if important and evaluation else copy.copy(shared)
+        uniform = important and dataset is not self.train_dataset
+        self.config.pixel_sampler = PixelSamplerConfig(**_shared_settings(shared)) if uniform else copy.copy(shared)
         try:
             return super()._get_pixel_sampler(dataset, num_rays_per_batch)
         finally:
@@ -58,12 +58,11 @@ def attach(trainer: Any, **settings: Any) -> None:
     """Give a trainer of any nerfstudio method this pixel sampler: after trainer.setup(), before trainer.train().
 
     Args:
-        trainer: nerfstudio's, with a VanillaDataManager.
         settings: fields of EdgeSEPixelSamplerConfig: early, late, edge_filter, ...
 
     Raises:
-        InputError: another data manager, a sampler of a purpose of its own (patches, pairs), or settings or cameras
-            that have no meaning here.
+        InputError: another data manager than a VanillaDataManager, a sampler of a purpose of its own (patches, pairs),
+            or settings or cameras that have no meaning here.
     """
     manager = trainer.pipeline.datamanager
     if not isinstance(manager, VanillaDataManager):
@@ -101,11 +100,6 @@ def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
     if loader.cache_all_images:
         sampler.check_images(loader.cached_collated_batch)
     return callbacks
-
-
-def _uniform_config(shared: PixelSamplerConfig) -> PixelSamplerConfig:
-    """nerfstudio's own uniform sampler, with the settings that both have."""
-    return PixelSamplerConfig(**_shared_settings(shared))
 
 
 def _shared_settings(config: PixelSamplerConfig) -> dict[str, Any]:

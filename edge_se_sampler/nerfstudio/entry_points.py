@@ -1,7 +1,6 @@
 """What nerfstudio loads: the methods, or None for each if they cannot be had.
 
-nerfstudio loads entry points unguarded, so an exception here would break every `ns-train`. What is no
-MethodSpecification it warns about and passes over.
+It loads entry points unguarded, so an exception here would break every `ns-train`; None it passes over with a warning.
 """
 
 from __future__ import annotations

@@ -33,19 +33,19 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
     """Draw a step's pixels from all loaded images (nerfstudio) or from one image (the paper); an image is chosen
     first, a pixel in it second."""
 
+    def rules(self) -> list[tuple[str, bool, str]]:
+        """Those of every host, and nerfstudio's."""
+        no_weights = "nerfstudio's losses take no weights; leave it at 0, or train with edge-se"
+        not_alone = "nerfstudio's models render coarse colors only together with the fine ones; take fine or cached"
+        return [
+            *super().rules(),
+            ("importance_weight", not self.importance_weight, no_weights),
+            ("error_source", self.error_source != "coarse", not_alone),
+        ]
+
     def check(self) -> None:
         """Raise InputError for a value, a combination or a camera that has no meaning here."""
         super().check()
-        if self.importance_weight:
-            raise InputError(
-                f"pixel-sampler.importance-weight is {self.importance_weight}: nerfstudio's losses take no weights; "
-                "leave it at 0, or train with edge-se"
-            )
-        if self.error_source == "coarse":
-            raise InputError(
-                f"pixel-sampler.error-source is {self.error_source!r}: nerfstudio's models render their coarse colours "
-                "only together with the fine ones; take fine or cached"
-            )
         # both come from the cameras: the host's sampler then draws by solid angle, or inside the crop circle alone
         if bool(self.is_equirectangular):
             raise InputError("the cameras are equirectangular: not supported here; " + USE_OWN_SAMPLER)
@@ -56,14 +56,14 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
     """The sampler of the standalone program on nerfstudio's base class, with nerfstudio's settings."""
 
+    _warned = False
+
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """As ImportantPixels.sample; an unbound sampler says once that it draws uniformly."""
         if not self.is_bound and not self._warned:
             self._warned = True
             print(UNBOUND, file=sys.stderr)
         return super().sample(image_batch)
-
-    _warned = False
 
     def __getstate__(self) -> Any:
         """Refuse to be sent to a worker process (nerfstudio's ParallelDataManager), which has no model."""

@@ -31,16 +31,13 @@ def planned_steps(trainer: Any) -> int:
         InputError: the file beside the loaded checkpoint's folder is no plan, or this run's cannot be written.
     """
     steps = trainer.config.max_num_iterations
-    loaded = _loaded_run(trainer)
-    if loaded:
+    if loaded := _loaded_run(trainer):
         plan = loaded / PLAN_FILE
         if plan.exists():
             steps = _read_plan(plan)
         else:
-            print(
-                f"edge-se-sampler: no plan at {plan}: the phases follow this run's max-num-iterations, {steps}",
-                file=sys.stderr,
-            )
+            problem = f"no plan at {plan}: the phases follow this run's max-num-iterations, {steps}"
+            print(f"edge-se-sampler: {problem}", file=sys.stderr)
     if trainer.local_rank == 0:
         plan = trainer.checkpoint_dir.parent / PLAN_FILE
         plan.parent.mkdir(parents=True, exist_ok=True)
@@ -55,9 +52,8 @@ def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
         InputError: the file beside the loaded checkpoint's folder holds no such state.
     """
     loaded = _loaded_run(trainer)
-    if not loaded or not (loaded / SCHEDULE_FILE).exists():
+    if not loaded or not (path := loaded / SCHEDULE_FILE).exists():
         return
-    path = loaded / SCHEDULE_FILE
     try:
         state = json.loads(path.read_text()).get(str(trainer._start_step - 1))
         if state is not None:
@@ -89,12 +85,11 @@ def _loaded_run(trainer: Any) -> Path | None:
 
 
 def _read_plan(path: Path) -> int:
+    remedy = "delete it to follow max-num-iterations"
     try:
         steps = json.loads(path.read_text())["planned_steps"]
     except (OSError, ValueError, KeyError, TypeError) as problem:
-        raise InputError(f"{path}: cannot be read ({problem!r}); delete it to follow max-num-iterations") from problem
+        raise InputError(f"{path}: cannot be read ({problem!r}); {remedy}") from problem
     if type(steps) is not int or steps < 1:
-        raise InputError(
-            f"{path}: planned_steps is {steps!r}, not a number of steps; delete it to follow max-num-iterations"
-        )
+        raise InputError(f"{path}: planned_steps is {steps!r}, not a number of steps; {remedy}")
     return steps

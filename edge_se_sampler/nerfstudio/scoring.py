@@ -24,11 +24,7 @@ DEAD_ERROR_SHARE = 0.98
 
 
 def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
-    """(n,) squared errors of the model's fine colours, compared as its loss compares them.
-
-    Raises:
-        InputError: the model renders neither "rgb" nor "rgb_fine".
-    """
+    """(n,) squared errors of the model's fine colors, compared as in its loss; raises as `squared_errors`."""
     with _preserved_state(model):
         return squared_errors(model, model(ray_bundle), batch["image"])
 
@@ -42,15 +38,13 @@ def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Ten
     Raises:
         InputError: the outputs have neither "rgb" nor "rgb_fine".
     """
-    level = next((level for level in ("", "_fine") if f"rgb{level}" in outputs), None)
-    if level is None:
-        raise InputError(
-            f"{type(model).__name__} renders neither rgb nor rgb_fine: its squared errors cannot be computed"
-        )
+    level = "" if "rgb" in outputs else "_fine"
+    if f"rgb{level}" not in outputs:
+        name = type(model).__name__
+        raise InputError(f"{name} renders neither rgb nor rgb_fine: its squared errors cannot be computed")
     colors = outputs[f"rgb{level}"]
     image = image.to(colors.device)
-    if image.dtype == torch.uint8:
-        image = image.float() / 255
+    image = image.float() / 255 if image.dtype == torch.uint8 else image
     accumulation = outputs.get(f"accumulation{level}")
     renderer: Any = getattr(model, "renderer_rgb", None)
     if accumulation is not None and hasattr(renderer, "blend_background_for_loss_computation"):
@@ -96,9 +90,9 @@ def _warn_if_dead(schedule: Schedule) -> None:
 def _preserved_state(model: nn.Module) -> Iterator[None]:
     """Render as training does, pose corrections and all, and leave everything as it was.
 
-    The random numbers are others than the training pass will see, and the host's generators go on from where they
-    were. nerfacto's proposal sampler counts the steps since it last let gradients through; a forward pass that
-    resets the counter takes the next step's turn, and the proposal networks would never be trained again.
+    Random numbers are others than training will see; the host's generators go on from where they were. nerfacto's
+    proposal sampler counts the steps since it last let gradients through: a forward pass that resets the counter takes
+    the next step's turn, and the proposal networks would never be trained again.
     """
     counters = [(m, m._steps_since_update) for m in model.modules() if hasattr(m, "_steps_since_update")]
     was_training = model.training

@@ -19,7 +19,7 @@ def summarize_errors(
 
     Args:
         error: (n,) e.
-        distance: (n,) b, see `PlainBackgrounds.squared_distance`.
+        distance: (n,) b.
         edge_ratio: (n,) p/u.
         density_ratio: (n,) probability with which each pixel was really drawn, over u.
 
@@ -27,8 +27,8 @@ def summarize_errors(
         how many pixels show the object, E[e], E[b], U[e].
     """
     as_edge, as_uniform = edge_ratio / density_ratio, 1 / density_ratio
-    means = (np.mean(values) for values in (error * as_edge, distance * as_edge, error * as_uniform))
-    edge_error, edge_background, uniform_error = map(float, means)
+    means = (float(np.mean(values)) for values in (error * as_edge, distance * as_edge, error * as_uniform))
+    edge_error, edge_background, uniform_error = means
     return float(np.count_nonzero(distance > MIN_OBJECT_DISTANCE)), edge_error, edge_background, uniform_error
 
 
@@ -37,20 +37,13 @@ class PlainBackgrounds:
     median."""
 
     def __init__(self) -> None:
-        self._numbers = np.zeros(0, dtype=np.int64)  # ascending
-        self._colors = np.zeros((0, 3), dtype=np.float32)
+        self._colors: dict[int, np.ndarray] = {}  # by image number
 
     def add(self, batch: ImageBatch) -> None:
         """Take up the borders of images that are new, unless they have alpha."""
-        if batch.channels == 4:
-            return
-        numbers = batch.numbers.cpu().numpy()
-        new = np.flatnonzero(~np.isin(numbers, self._numbers)).tolist()
-        if new:
-            colors = np.concatenate((self._colors, [_border_color(batch.image(k)) for k in new]))
-            self._numbers = np.concatenate((self._numbers, numbers[new]))
-            order = np.argsort(self._numbers)
-            self._numbers, self._colors = self._numbers[order], colors[order]
+        for k, number in enumerate(batch.numbers.tolist()):
+            if number not in self._colors and batch.per_pixel["image"][k].shape[2] == 3:
+                self._colors[number] = _border_color(batch.image(k))
 
     def squared_distance(
         self, image: np.ndarray, numbers: np.ndarray, background_color: tuple[float, float, float]
@@ -60,13 +53,13 @@ class PlainBackgrounds:
         Args:
             image: (n, 3|4) pixels, uint8 or float in [0, 1].
             numbers: (n,) of their images.
-            background_color: RGB in [0, 1] that images with alpha are composited on.
+            background_color: RGB in [0, 1] behind transparent pixels.
         """
         image = unit_float(image[None])[0]
         if image.shape[1] == 4:
             difference = image[:, 3:] * (image[:, :3] - np.array(background_color, dtype=np.float32))
         else:
-            difference = image - self._colors[np.searchsorted(self._numbers, numbers)]
+            difference = image - np.stack([self._colors[number] for number in numbers.tolist()])
         return np.square(difference).sum(axis=1)
 
 

@@ -2,7 +2,6 @@
 
 k       images that a draw may choose from; image first, pixel second (strengths normalised over all images
         would starve smooth ones)
-H, W    rows and columns of an image; images may differ in size
 s       strength of a pixel, >= 0 (equation 5: |E| + eps; 0: never drawn)
 p       probability of a pixel within its image, s / sum(s)
 B       children of a node: B consecutive pixels (row-major) make a block, B blocks a superblock
@@ -33,9 +32,9 @@ class UniformPixels:
     """Pixels of each image's centered box, all alike: Random (equation 2) or Precrop (equation 3).
 
     Args:
-        sizes: (k, 2) rows and columns of each image.
-        fraction: side of the box as a share of the image's side, in (0, 1]; 1 is the whole image, 0.5 the
-            paper's Precrop, H/4 <= i < 3H/4. A box has at least one pixel.
+        sizes: rows and columns of each image.
+        fraction: side of the box as a share of the image's side, in (0, 1]; 0.5 is the paper's Precrop,
+            H/4 <= i < 3H/4. A box has at least one pixel.
     """
 
     def __init__(self, sizes: Sequence[tuple[int, int]], fraction: float = 1.0):
@@ -49,13 +48,10 @@ class UniformPixels:
         return torch.ones(len(images), dtype=torch.bool)
 
     def draw(self, images: Tensor, n: int, rng: np.random.Generator) -> Tensor:
-        """n draws with replacement.
+        """n draws with replacement: (n, 3) int64 position in `images`, row, column.
 
         Args:
             images: (k,) int64, numbers of images in the order of `sizes`.
-
-        Returns:
-            (n, 3) int64: position in `images`, row, column.
         """
         u = torch.from_numpy(rng.random((n, 3)))
         which = (u[:, 0] * len(images)).long()
@@ -96,8 +92,7 @@ class PixelTable:
         """Append images.
 
         Args:
-            strengths: one (H, W) tensor an image, >= 0 and finite; read one at a time, so that a generator
-                keeps the peak near the finished tables.
+            strengths: (H, W) of each image, >= 0 and finite; a generator keeps the peak near the finished tables.
 
         Raises:
             ValueError: a strength that is negative or not finite, or an image without pixels.
@@ -128,14 +123,12 @@ class PixelTable:
         return torch.from_numpy(self._slot[images.numpy()] >= 0)
 
     def draw(self, images: Tensor, n: int, rng: np.random.Generator) -> Tensor:
-        """n draws with replacement.
+        """n draws with replacement: (n, 3) int64 position in `images`, row, column.
+
+        They are ordered by image and superblock: a part of them must be taken in strides, not from the beginning.
 
         Args:
             images: (k,) int64, numbers of images in the order they were added; all `drawable`.
-
-        Returns:
-            (n, 3) int64: position in `images`, row, column; ordered by image and superblock, so a part of the
-            draw must be taken in strides, not from its beginning.
         """
         above, within = rng.bit_generator.random_raw(2 * n).reshape(2, n)
         above.sort()  # a search for ascending targets touches memory in order: 1/4 of the time of a draw
@@ -213,8 +206,7 @@ def _level(child_mass: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _child(cumulative: np.ndarray, node: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The children that targets in [0, CDF_SCALE) fall into: (nodes, B) shares, (n,) nodes, (n,) -> (n,) numbers of
-    children, counted through all nodes.
+    """The children that targets in [0, CDF_SCALE) fall into, counted through all nodes: (nodes, B), (n,), (n,) -> (n,).
 
     A binary search in log2(B) gathers: copying the nodes' rows for torch.searchsorted takes twice the time.
     """

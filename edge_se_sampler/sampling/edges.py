@@ -75,11 +75,8 @@ def _canny(gray: np.ndarray) -> np.ndarray:
     return (edges[2:-2, 2:-2] > 0).astype(np.float32)
 
 
-FILTERS: dict[EdgeFilter, Callable[[np.ndarray], np.ndarray]] = {
-    "sobel": _sobel,
-    "laplacian": _laplacian,
-    "canny": _canny,
-}
+FILTERS: dict[EdgeFilter, Callable[[np.ndarray], np.ndarray]]
+FILTERS = {"sobel": _sobel, "laplacian": _laplacian, "canny": _canny}
 
 
 def edge_strength(
@@ -89,7 +86,7 @@ def edge_strength(
     source: EdgeSource = "color",
     background: tuple[float, float, float] = WHITE,
 ) -> np.ndarray:
-    """How strong an edge every pixel lies on (paper, equation 4).
+    """How strong an edge every pixel lies on (paper, equation 4): (H, W) float32, finite, >= 0.
 
     Args:
         image: (H, W, 3|4), uint8 or float in [0, 1], straight alpha.
@@ -98,19 +95,13 @@ def edge_strength(
             no color edge).
         background: RGB behind transparent pixels.
 
-    Returns:
-        (H, W) float32, finite, >= 0.
-
     Raises:
         ValueError: a malformed image, or alpha edges of an image without alpha.
     """
-    image = unit_float(image)
-    if source != "color" and image.shape[2] == 3:
-        raise ValueError(f"edge source {source!r} needs images with an alpha channel; these have none: use 'color'")
-    phi = FILTERS[edge_filter]
-    if source == "alpha":
-        return phi(np.ascontiguousarray(image[..., 3]))
-    color = phi(luma(image, background))
+    image, phi = unit_float(image), FILTERS[edge_filter]
     if source == "color":
-        return color
-    return np.maximum(color, phi(np.ascontiguousarray(image[..., 3])))
+        return phi(luma(image, background))
+    if image.shape[2] == 3:
+        raise ValueError(f"edge source {source!r} needs images with an alpha channel; these have none: use 'color'")
+    alpha = phi(np.ascontiguousarray(image[..., 3]))
+    return alpha if source == "alpha" else np.maximum(phi(luma(image, background)), alpha)

@@ -35,33 +35,23 @@ class ErrorMap:
         return len(self.values)
 
     def add(self, images: dict[int, tuple[int, int]]) -> None:
-        """Make room for images.
-
-        Args:
-            images: image number -> rows, columns. Where blocks have to grow to make room, all entries are lost.
-        """
+        """Make room for images: number -> rows, columns. Where blocks have to grow for it, all entries are lost."""
         new = {number: size for number, size in images.items() if number not in self.sizes}
         if not new:
             return
         side, kept = self.side, len(self.values)
         self.sizes |= new
         self._lay_out()
-        total = int(self._first[-1])
-        values, updated = np.zeros(total, dtype=np.float32), np.zeros(total, dtype=np.int32)
+        values, updated = np.zeros(self._first[-1], dtype=np.float32), np.zeros(self._first[-1], dtype=np.int32)
         if side == self.side:
             values[:kept], updated[:kept] = self.values, self.updated
         self._set_entries(values, updated)
 
     def lookup(self, indices: np.ndarray, step: int, pixels_per_step: int) -> np.ndarray:
-        """Expected squared errors of pixels.
+        """Expected squared errors of pixels at a step: (n, 3) int64 image number, row, column -> (n,) float64, >= 0.
 
         Args:
-            indices: (n, 3) int64 image number, row, column.
-            step: the current one.
-            pixels_per_step: that are trained on.
-
-        Returns:
-            (n,) float64, >= 0.
+            pixels_per_step: how many are trained on.
         """
         block = self._block_of(indices)
         mean = self._sum / max(1, self._known)
@@ -70,13 +60,7 @@ class ErrorMap:
         return mean + (self.values[block] - mean) * np.where(self.updated[block] > 0, decay, 0.0)
 
     def update(self, indices: np.ndarray, squared_error: np.ndarray, step: int) -> None:
-        """Enter what a step has found; of several pixels in a block their mean.
-
-        Args:
-            indices: (n, 3) int64 image number, row, column.
-            squared_error: (n,).
-            step: in which it was found.
-        """
+        """Enter the squared errors (n,) that a step has found at pixels (n, 3); of several in a block their mean."""
         block, inverse = np.unique(self._block_of(indices), return_inverse=True)
         found = np.bincount(inverse, squared_error) / np.bincount(inverse)
         new = self.updated[block] == 0
@@ -89,7 +73,7 @@ class ErrorMap:
     def state_dict(self) -> dict[str, Any]:
         """Images and entries, for a checkpoint."""
         sizes = [[number, *size] for number, size in self.sizes.items()]
-        values, updated = (torch.from_numpy(entries.copy()) for entries in (self.values, self.updated))
+        values, updated = torch.tensor(self.values), torch.tensor(self.updated)
         return {"sizes": sizes, "values": values, "updated": updated, "sum": self._sum}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

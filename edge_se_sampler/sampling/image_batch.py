@@ -1,8 +1,4 @@
-"""A host's batch of images, stacked or in lists, read alike.
-
-k      images in the batch; they carry absolute numbers and may differ in size
-drawn  (n, 3) int64: position in the batch, row, column
-"""
+"""A host's batch of images, stacked or in lists, read alike."""
 
 from __future__ import annotations
 
@@ -18,12 +14,11 @@ from edge_se_sampler.sampling.edges import WHITE
 
 @dataclass(frozen=True)
 class ImageBatch:
-    """A batch of k images and whatever else it holds for each pixel."""
+    """A batch of k images, which may differ in size, and whatever else it holds for each pixel."""
 
     numbers: Tensor
     """(k,) int64: absolute image numbers."""
-    sizes: list[tuple[int, int]]
-    """Rows and columns of each image."""
+    sizes: list[tuple[int, int]]  # rows and columns
     per_pixel: dict[str, Any]
     """Key -> k tensors (H, W, ...), stacked or in a list; "image" among them."""
     mask: Any
@@ -61,11 +56,6 @@ class ImageBatch:
         """Where the images are."""
         return self.per_pixel["image"][0].device
 
-    @property
-    def channels(self) -> int:
-        """3 or 4, of every image."""
-        return self.per_pixel["image"][0].shape[-1]
-
     def image(self, k: int) -> np.ndarray:
         """Image at position k, (H, W, 3|4), as it is stored."""
         return self.per_pixel["image"][k].cpu().numpy()
@@ -75,7 +65,11 @@ class ImageBatch:
         return self.mask[k].reshape(self.sizes[k]).bool().cpu()
 
     def gather(self, drawn: Tensor) -> dict[str, Any]:
-        """Every per-pixel key at the drawn pixels, and `indices` with absolute image numbers."""
+        """Every per-pixel key at drawn pixels, and `indices` (n, 3) int64: absolute image number, row, column.
+
+        Args:
+            drawn: (n, 3) int64: position in the batch, row, column.
+        """
         pixels = {key: self._pick(value, drawn.to(value[0].device)) for key, value in self.per_pixel.items()}
         numbers = self.numbers.to(drawn.device)[drawn[:, :1]]
         pixels["indices"] = torch.cat((numbers, drawn[:, 1:]), dim=1).to(self.device)
@@ -96,7 +90,7 @@ class ImageBatch:
 def _sizes(images: Any) -> list[tuple[int, int]]:
     """Rows and columns of k images, stacked or in a list; nothing for what holds no images."""
     if isinstance(images, Tensor):
-        return [(int(images.shape[1]), int(images.shape[2]))] * len(images) if images.ndim >= 3 else []
+        return [(images.shape[1], images.shape[2])] * len(images) if images.ndim >= 3 else []
     if not isinstance(images, list) or not all(isinstance(image, Tensor) and image.ndim >= 2 for image in images):
         return []
-    return [(int(image.shape[0]), int(image.shape[1])) for image in images]
+    return [(image.shape[0], image.shape[1]) for image in images]

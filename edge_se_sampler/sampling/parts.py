@@ -1,6 +1,5 @@
-"""The parts that a pixel sampler is composed of: a distribution draws candidates, a selector keeps some of them.
+"""The parts of a pixel sampler: a distribution draws candidates, a selector keeps some of them.
 
-n    pixels drawn in a step; m candidates, of which n are kept
 p/u  density ratio of a pixel: its probability as it was drawn over that under uniform sampling
 """
 
@@ -26,13 +25,11 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 class TrainingStep:
     """What the draws of a step depend on besides the images."""
 
-    number: int = 0
-    """0, 1, 2, ..."""
+    number: int = 0  # 0, 1, 2, ...
     seed: int = 0
     rank: int = 0
-    """This process among those of a distributed run."""
+    """This process among `world` of a distributed run. They share one draw, each taking every world-th pixel."""
     world: int = 1
-    """Processes of the run. Those that hold the same images share one draw, each taking every world-th pixel."""
     squared_error: Callable[[PixelBatch], Tensor] | None = None
     """The model's current squared errors at drawn pixels, (n,); None: there is no model to ask."""
 
@@ -45,14 +42,13 @@ class PixelBatch:
     pixels: Tensor
     """(n, 3) int64 on the CPU: position in the batch, row, column."""
     values: dict[str, Any]
-    """Every per-pixel key of the batch at these pixels, and `indices` (n, 3) with absolute image numbers."""
-    distribution: Distribution
-    """What drew them."""
+    """What `ImageBatch.gather` returns at these pixels."""
+    distribution: Distribution  # what drew them
     kept_ratio: Tensor | None = None
     """(n,) how much likelier than the average candidate each was kept by a selector; None: all were kept."""
 
     def density_ratio(self, rows: slice = slice(None)) -> Tensor:
-        """p/u of these pixels, or of some rows of them."""
+        """(n,) p/u of these pixels, or of some rows of them."""
         ratio = self.distribution.density_ratio(self.batch, self.pixels[rows])
         return ratio if self.kept_ratio is None else ratio.float() * self.kept_ratio[rows]
 
@@ -62,24 +58,24 @@ class PixelBatch:
         return PixelBatch(self.batch, self.pixels[rows.cpu()], values, self.distribution, kept_ratio.cpu())
 
 
-class SamplerPart(ABC):  # noqa: B024 (a base of three kinds of parts, each with methods of its own)
+class SamplerPart:
     """Part of a pixel sampler: it may learn from squared errors, and then has a state that belongs in checkpoints."""
 
     needs_errors: bool = False
-    """Whether it is to be updated with the squared errors found at drawn pixels."""
+    """Whether it is to be updated."""
 
-    def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:  # noqa: B027
+    def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:
         """Learn from squared errors (n,) found at the drawn pixels of a step."""
 
     def state_dict(self) -> dict[str, Any]:
         """What was learnt."""
         return {}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:  # noqa: B027
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""
 
 
-class Distribution(SamplerPart):
+class Distribution(SamplerPart, ABC):
     """Draws pixels in proportion to their strength, image first, pixel second.
 
     Tables of an image are built when it is first met, and kept: its pixels and its mask are taken to stay the same.
@@ -93,24 +89,17 @@ class Distribution(SamplerPart):
 
     @abstractmethod
     def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
-        """Strength of every pixel.
+        """Strength of every pixel: (H, W) float, finite, >= 0; 0 is never drawn.
 
         Args:
             image: (H, W, 3|4), uint8 or float in [0, 1].
             background_color: RGB in [0, 1] behind transparent pixels.
-
-        Returns:
-            (H, W) float, finite, >= 0; 0 is never drawn.
         """
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
-        """Draw `count` pixels with replacement: from one image, or from all.
-
-        Raises:
-            InputError: there is no pixel to draw, or an image has no strengths.
-        """
+        """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`."""
         rng = stream(step.seed, step.number, Stream.PIXELS)
-        source, table_index, drawable = self._drawable(batch)
+        source, table_index, drawable = self.drawable(batch)
         if self.settings.images_per_step == "one":
             drawable = drawable[rng.integers(len(drawable), size=1)]
         # strided: a table's draws come ordered by image
@@ -122,14 +111,6 @@ class Distribution(SamplerPart):
         """p/u (n,) of pixels (n, 3): position in the batch, row, column."""
         source, table_index = self.tables(batch)
         return source.density_ratio(table_index, pixels)
-
-    def check_images(self, batch: ImageBatch) -> None:
-        """Refuse images that nothing could be drawn from. Tables are built by that.
-
-        Raises:
-            InputError: as `draw`.
-        """
-        self._drawable(batch)
 
     def clear(self) -> None:
         """Give back the memory of the tables."""
@@ -160,9 +141,13 @@ class Distribution(SamplerPart):
             raise InputError(f"image {int(batch.numbers[k])}: {problem}") from problem
         return strength if batch.mask is None else strength * batch.valid(k)
 
-    def _drawable(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
-        """What `tables` returns, and the positions that have a pixel to draw, by ascending image number: hosts
-        collate images in any order, and a draw should not depend on it."""
+    def drawable(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
+        """What `tables` returns, and the positions of images with a pixel to draw, by ascending image number: hosts
+        collate images in any order, and a draw should not depend on it.
+
+        Raises:
+            InputError: there is no pixel to draw, or an image has no strengths.
+        """
         source, table_index = self.tables(batch)
         drawable = torch.nonzero(source.drawable(table_index))[:, 0]
         drawable = drawable[torch.argsort(batch.numbers.cpu()[drawable])]
@@ -172,19 +157,18 @@ class Distribution(SamplerPart):
 
 
 class Selector(SamplerPart):
-    """Chooses the pixels to train on among candidates that a distribution has drawn."""
+    """Chooses the pixels to train on among candidates that a distribution has drawn; this one keeps them all."""
 
-    name: ClassVar[str]
     candidates_per_pixel: int = 1
     """Candidates to draw for each pixel that is trained on."""
 
     def __init__(self, settings: SamplingSettings) -> None:
         self.settings = settings
 
-    @abstractmethod
     def select(self, candidates: PixelBatch, count: int, step: TrainingStep) -> PixelBatch:
         """`count` of the candidates.
 
         Raises:
             FloatingPointError: a candidate's squared error is not finite.
         """
+        return candidates

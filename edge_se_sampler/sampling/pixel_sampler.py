@@ -1,9 +1,4 @@
-"""The pixel sampler: a strategy, early and late, under any host's PixelSampler.
-
-`ImportantPixels` is a mixin: put before a host's PixelSampler it decides which pixels are drawn and gathers them;
-the base contributes only its config and batch size. It is the same code under our protocol's base and under
-nerfstudio's, and draws the same pixels there.
-"""
+"""The pixel sampler: an early and a late strategy, under our protocol's PixelSampler or nerfstudio's."""
 
 from __future__ import annotations
 
@@ -27,7 +22,8 @@ SquaredError = Callable[[dict[str, Any]], Tensor]
 
 
 class ImportantPixels:
-    """Mixin over a host's PixelSampler: Random, Precrop or Edge, then Random or squared error.
+    """Mixin over a host's PixelSampler, which contributes its config and batch size: Random, Precrop or Edge, then
+    Random or squared error.
 
     Unbound (in evaluation, viewers, exporters) it draws uniformly. `bind` and `set_step` make it follow a training
     run; the data manager calls them. Masked pixels are never drawn.
@@ -47,7 +43,6 @@ class ImportantPixels:
         self.background_color: tuple[float, float, float] = kwargs.get("background_color") or WHITE
         """To be changed only before anything is drawn: tables of edges stay what they are."""
         self.strategies = build_strategies(self.config)
-        """By name: uniform, early and late."""
         self.schedule: Schedule = FixedSchedule(0)
         self.pending_batch: PixelBatch | None = None
         """The last sample's pixels while their squared errors are wanted and not yet known, see `observe`."""
@@ -60,9 +55,8 @@ class ImportantPixels:
         """Follow a training run.
 
         Args:
-            squared_error: scores candidates, see `SquaredError`.
+            squared_error: scores candidates.
             planned_steps: length of the run as first planned; resuming does not change it.
-            seed: of the draws.
             rank: of this process among `world` of a distributed run, see `TrainingStep`.
         """
         self._squared_error = squared_error
@@ -83,7 +77,7 @@ class ImportantPixels:
 
     @property
     def strategy(self) -> str:
-        """Name of the current step's strategy: "uniform", "precrop", "edge" or "se"."""
+        """Name of the current step's strategy, such as "edge"."""
         if not self.is_bound:
             return Uniform.name
         return self.config.early if self.schedule.phase(self._step.number) == "early" else self.config.late
@@ -96,7 +90,7 @@ class ImportantPixels:
         """
         batch = self._read(image_batch)
         for name in {self.config.early, Uniform.name}:
-            self.strategies[name].distribution.check_images(batch)
+            self.strategies[name].distribution.drawable(batch)
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
@@ -125,11 +119,7 @@ class ImportantPixels:
         return pixels
 
     def observe(self, squared_error: Tensor) -> None:
-        """Learn what training found at the pixels of the last sample, if their errors are wanted.
-
-        Args:
-            squared_error: (N,) of the model's (fine) colors.
-        """
+        """Learn the squared errors (N,) that training found at the last sample's pixels, if they are wanted."""
         if self.pending_batch is not None:
             drawn, self.pending_batch = self.pending_batch, None
             self._update(drawn, squared_error)
@@ -172,10 +162,9 @@ class ImportantPixels:
         assert self._squared_error is not None
         with torch.no_grad():
             errors = self._squared_error(candidates.values)
-        if errors.shape != (len(candidates.pixels),):
-            raise ValueError(
-                f"{len(candidates.pixels)} candidates were scored by errors of shape {tuple(errors.shape)}"
-            )
+        count = len(candidates.pixels)
+        if errors.shape != (count,):
+            raise ValueError(f"{count} candidates were scored by errors of shape {tuple(errors.shape)}")
         self._scored = True
         self._update(candidates, errors)
         return errors

@@ -1,9 +1,8 @@
 """Random numbers that need no state: every draw is a function of (seed, step, stream).
 
-Philox is counter-based (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the seed and the
-stream are its key, the step and the rank sit in the second and third words of its counter. Streams therefore never
-overlap (each step owns 2^64 blocks), a resumed run needs no saved generator, and the global generators are neither
-read nor moved.
+Philox is counter-based (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): its key is the seed and the
+stream, the second and third words of its counter are the step and the rank. So streams never overlap (each step owns
+2^64 blocks), a resumed run needs no saved generator, and the global generators are neither read nor moved.
 """
 
 from __future__ import annotations
@@ -16,18 +15,12 @@ import numpy as np
 class Stream(IntEnum):
     """What a random number is for; the value is part of the key and must never change."""
 
-    PIXELS = 1
-    """Which pixels a step draws."""
-    SELECTION = 2
-    """Which candidates squared-error sampling keeps."""
-    MODEL = 3
-    """Jitter of samples along rays, density noise, random backgrounds."""
-    WEIGHTS = 4
-    """Initial weights of the networks."""
-    UNSEEN = 5
-    """Poses and pixels of unseen rays (InfoNeRF)."""
-    PROBE = 6
-    """Rays that show whether a network is dead."""
+    PIXELS = 1  # which pixels a step draws
+    SELECTION = 2  # which candidates squared-error sampling keeps
+    MODEL = 3  # jitter of samples along rays, density noise, random backgrounds
+    WEIGHTS = 4  # initial weights of the networks
+    UNSEEN = 5  # poses and pixels of unseen rays (InfoNeRF)
+    PROBE = 6  # rays that show whether a network is dead
 
 
 def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Generator:

@@ -2,14 +2,12 @@
 
 m      candidates, drawn uniformly (the paper: m = 2N)
 N      candidates kept for training
-r_i    rank of candidate i by ascending squared error, 1 .. m; the largest error has rank m
-w_i    r_i, the weight of candidate i (equation 7 without its normalisation)
+w_i    weight of candidate i: its rank by ascending squared error, 1 .. m (equation 7 without its normalisation)
 e_i    independent Exponential(1); e_i / w_i is the time at which candidate i arrives
 tau    arrival time of the (N + 1)-th
 
 The N first arrivals are a weighted draw without replacement (Efraimidis and Spirakis 2006): one sort, no loop.
-Equation 6 says argsort, which literally gives the indices that sort, weights that have nothing to do with the
-error. The true rank is meant, and taken.
+Equation 6 says argsort, literally the indices that sort, which have nothing to do with the error; ranks are meant.
 """
 
 from __future__ import annotations
@@ -55,8 +53,7 @@ def sample_by_rank(squared_error: Tensor, keep: int, rng: np.random.Generator) -
     errors = squared_error.detach().double().cpu().numpy()
     if not 1 <= keep <= len(errors):
         raise ValueError(f"cannot keep {keep} of {len(errors)} candidates")
-    bad = int((~np.isfinite(errors)).sum())
-    if bad:
+    if bad := np.count_nonzero(~np.isfinite(errors)):
         raise FloatingPointError(f"the squared errors of {bad} of {len(errors)} candidates are not finite")
     weights = error_ranks(errors, rng)
     arrival = rng.standard_exponential(len(errors)) / weights

@@ -28,17 +28,15 @@ GAIN_TO_END, GAIN_TO_RETURN = 4.0, 4.5
 below the first; above the second it returns. The ratio rises while details are learnt, so lower thresholds would hold
 on to edges for too long where the object is large, and higher ones would leave small objects too early."""
 WINDOW_STEPS, WINDOW_PIXELS = 16, 256
-"""Means are over about so many steps, or so many pixels of the object if those take longer; a phase lasts that at
-least."""
+"""A phase lasts, and means are over, at least about so many steps and so many pixels of the object."""
 MAX_PIXELS = 256
-"""Pixels of a step that are looked at, at most twice as many: enough for the means, in a third of a millisecond."""
+"""Pixels of a step that are looked at, at most twice as many: enough for the means."""
 
 
 class Schedule(SamplerPart):
     """Says which phase a step is in."""
 
-    early_may_return: bool = False
-    """Whether the early phase can begin again after the late one."""
+    early_may_return: bool = False  # after the late phase
 
     @abstractmethod
     def phase(self, step: int) -> Phase:
@@ -52,18 +50,12 @@ class FixedSchedule(Schedule):
         self.early_steps = early_steps
 
     def phase(self, step: int) -> Phase:
-        """See `Schedule.phase`."""
         return "early" if step < self.early_steps else "late"
 
 
 class AdaptiveSchedule(Schedule):
-    """Early while edges pay, and again when they pay again or the object is lost.
-
-    It knows no number of steps to come, so that it does the same in a short and in a long run.
-
-    Args:
-        edges: the early distribution.
-    """
+    """Early while edges pay, and again when they pay again or the object is lost. It knows no number of steps to come,
+    so that it does the same in a short and in a long run."""
 
     early_may_return = True
     needs_errors = True
@@ -91,13 +83,10 @@ class AdaptiveSchedule(Schedule):
         self.observe(*summarize_errors(error, distance, edge_ratio, drawn.density_ratio(rows).numpy()))
 
     def observe(self, count: float, edge_error: float, edge_background: float, uniform_error: float) -> None:
-        """Add a step's means to the running ones, and change the phase if they say so.
+        """Add a step's means E[e], E[b] and U[e] to the running ones, and change the phase if they say so.
 
         Args:
             count: pixels that show the object.
-            edge_error: E[e].
-            edge_background: E[b].
-            uniform_error: U[e].
         """
         self.observations += 1
         self._count += (count - self._count) / min(WINDOW_STEPS, self.observations)

@@ -19,14 +19,12 @@ def build_scorer(
 ) -> SquaredError:
     """A function that renders a sampler's candidates and returns their squared errors, for `ImportantPixels.bind`.
 
-    It renders a training batch at a time, so that it takes no more memory than training.
-
     Args:
-        sampler: its number of rays, which hosts may change at any time, is the size of a batch.
+        sampler: its number of rays, which hosts may change at any time, is how many are rendered at once, so that it
+            takes no more memory than training.
         pipeline: whose `model` is rendered. It must not be an attribute of a data manager: nerfstudio's is a module,
             and would count the model's weights as its own.
         ray_generator: (n, 3) indices -> ray bundle.
-        ray_errors: compares rendered rays with their pixels.
     """
 
     @torch.no_grad()

@@ -65,32 +65,31 @@ class SamplingSettings:
             return replace(self, early="uniform")
         return replace(self, early="edge", schedule="adaptive")
 
+    def rules(self) -> list[tuple[str, bool, str]]:
+        """Field, whether its value has a meaning, and what is wrong if not."""
+        in_steps, steps, weight = self.schedule == "steps", self.early_steps, self.importance_weight
+        all_uniform = self.early != "edge" and self.late == "uniform"
+        epsilon_range = "must be between 1e-6 and 1e6 (less would never train flat regions)"
+        not_in_steps = f"has no effect under schedule {self.schedule!r}; add --...schedule steps"
+        needs_edges = "'adaptive' compares edges with uniform pixels: it needs early edge"
+        return [
+            ("precrop_fraction", 0 < self.precrop_fraction <= 1, "must be above 0 and at most 1"),
+            ("early_fraction", 0 <= self.early_fraction <= 1, "must be between 0 and 1"),
+            ("early_steps", not in_steps or steps >= 1, "schedule 'steps' needs a number of steps, at least 1"),
+            ("early_steps", in_steps or not steps, not_in_steps),
+            ("schedule", self.schedule != "adaptive" or self.early == "edge", needs_edges),
+            ("edge_epsilon", 1e-6 <= self.edge_epsilon <= 1e6, epsilon_range),
+            ("se_candidates", self.se_candidates >= 2, "must be at least 2, or there is nothing to choose from"),
+            ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
+            ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
+            ("error_source", self.error_source == "fine" or self.late == "se", "has no effect without late se"),
+        ]
+
     def check(self) -> None:
         """Raise InputError for a value or a combination that has no meaning."""
-
-        def refuse(field: str, problem: str) -> None:
-            raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
-
-        if not 0 < self.precrop_fraction <= 1:
-            refuse("precrop_fraction", "must be above 0 and at most 1")
-        if not 0 <= self.early_fraction <= 1:
-            refuse("early_fraction", "must be between 0 and 1")
-        if self.schedule == "steps" and self.early_steps < 1:
-            refuse("early_steps", "schedule 'steps' needs a number of steps, at least 1")
-        if self.schedule != "steps" and self.early_steps:
-            refuse("early_steps", f"has no effect under schedule {self.schedule!r}; add --...schedule steps")
-        if self.schedule == "adaptive" and self.early != "edge":
-            refuse("schedule", "'adaptive' compares edges with uniform pixels: it needs early edge")
-        if not 1e-6 <= self.edge_epsilon <= 1e6:
-            refuse("edge_epsilon", "must be between 1e-6 and 1e6 (less would never train flat regions)")
-        if self.se_candidates < 2:
-            refuse("se_candidates", "must be at least 2, or there is nothing to choose from")
-        if not 0 <= self.importance_weight <= 1:
-            refuse("importance_weight", "must be between 0 and 1")
-        if self.importance_weight and self.early != "edge" and self.late == "uniform":
-            refuse("importance_weight", "has no effect when all pixels are drawn uniformly")
-        if self.error_source != "fine" and self.late != "se":
-            refuse("error_source", "has no effect without late se")
+        for field, valid, problem in self.rules():
+            if not valid:
+                raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run of `planned_steps`; without meaning under the adaptive schedule."""

@@ -26,11 +26,8 @@ class Uniform(Distribution):
     """All pixels alike (equation 2)."""
 
     name = "uniform"
-
-    @property
-    def box_fraction(self) -> float:
-        """Side of the centred box that is drawn from, as a share of the image's side."""
-        return 1.0
+    box_fraction = 1.0
+    """Side of the centered box that is drawn from, as a share of the image's side."""
 
     def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
         """1 inside of the box, 0 outside."""
@@ -47,20 +44,15 @@ class Uniform(Distribution):
             return super().tables(batch)
         return UniformPixels(batch.sizes, self.box_fraction), torch.arange(len(batch.sizes))
 
-    def density_ratio(self, batch: ImageBatch, pixels: Tensor) -> Tensor:
-        """1, within the box."""
-        return torch.ones(len(pixels), dtype=torch.float64)
-
 
 class Precrop(Uniform):
-    """All pixels of the centred box alike (equation 3)."""
+    """All pixels of the centered box alike (equation 3)."""
 
     name = "precrop"
 
-    @property
-    def box_fraction(self) -> float:
-        """The setting."""
-        return self.settings.precrop_fraction
+    def __init__(self, settings: SamplingSettings) -> None:
+        super().__init__(settings)
+        self.box_fraction = settings.precrop_fraction
 
 
 class Edge(Distribution):
@@ -69,32 +61,14 @@ class Edge(Distribution):
     name = "edge"
 
     def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
-        """|E| + epsilon.
-
-        Raises:
-            ValueError: a malformed image, or alpha edges of an image without alpha.
-        """
-        settings = self.settings
-        edges = edge_strength(
-            image, edge_filter=settings.edge_filter, source=settings.edge_source, background=background_color
-        )
-        return edges + np.float32(settings.edge_epsilon)
-
-
-class KeepAll(Selector):
-    """Every candidate is trained on."""
-
-    name = "all"
-
-    def select(self, candidates: PixelBatch, count: int, step: TrainingStep) -> PixelBatch:
-        """The candidates."""
-        return candidates
+        """|E| + epsilon; raises as `edge_strength`."""
+        edge_filter, source = self.settings.edge_filter, self.settings.edge_source
+        edges = edge_strength(image, edge_filter=edge_filter, source=source, background=background_color)
+        return edges + np.float32(self.settings.edge_epsilon)
 
 
 class RankedError(Selector):
     """By the rank of the squared error (equations 6 and 7): the model's, rendered for this, or the error map's."""
-
-    name = "se"
 
     def __init__(self, settings: SamplingSettings) -> None:
         super().__init__(settings)
@@ -106,8 +80,8 @@ class RankedError(Selector):
         """`count` of the candidates, without replacement, in proportion to the rank of their squared error."""
         if self.error_map is not None:
             self.error_map.add(candidates.batch.sizes_by_number)
-            errors = self.error_map.lookup(candidates.values["indices"].cpu().numpy(), step.number, count)
-            errors = torch.from_numpy(errors)
+            pixels = candidates.values["indices"].cpu().numpy()
+            errors = torch.from_numpy(self.error_map.lookup(pixels, step.number, count))
         else:
             assert step.squared_error is not None
             errors = step.squared_error(candidates)
@@ -118,8 +92,8 @@ class RankedError(Selector):
         """Enter the errors into the map."""
         assert self.error_map is not None
         self.error_map.add(drawn.batch.sizes_by_number)
-        errors = squared_error.double().cpu().numpy()
-        self.error_map.update(drawn.values["indices"].cpu().numpy(), errors, step.number)
+        pixels, errors = drawn.values["indices"].cpu().numpy(), squared_error.double().cpu().numpy()
+        self.error_map.update(pixels, errors, step.number)
 
     def state_dict(self) -> dict[str, Any]:
         """The error map's."""
@@ -132,9 +106,8 @@ class RankedError(Selector):
 
 
 DISTRIBUTIONS: dict[str, type[Distribution]] = {kind.name: kind for kind in (Uniform, Precrop, Edge)}
-"""By the name that `early` and `late` give them."""
-SELECTORS: dict[str, type[Selector]] = {RankedError.name: RankedError}
-"""By the name that `early` and `late` give them; their candidates are uniform."""
+SELECTORS: dict[str, type[Selector]] = {"se": RankedError}
+"""Both by the name that `early` and `late` give them; the candidates of a selector are uniform."""
 
 
 class Strategy(NamedTuple):
@@ -151,11 +124,10 @@ def build_strategies(settings: SamplingSettings) -> dict[str, Strategy]:
         InputError: an unknown name.
     """
     uniform = Uniform(settings)
-    strategies = {Uniform.name: Strategy(uniform, KeepAll(settings))}
+    strategies = {Uniform.name: Strategy(uniform, Selector(settings))}
     for name in (settings.early, settings.late):
         check_known("pixel-sampler", [name], (*DISTRIBUTIONS, *SELECTORS))
-        if name in SELECTORS:
-            strategies[name] = Strategy(uniform, SELECTORS[name](settings))
-        elif name not in strategies:
-            strategies[name] = Strategy(DISTRIBUTIONS[name](settings), KeepAll(settings))
+        if name not in strategies:
+            distribution = DISTRIBUTIONS[name](settings) if name in DISTRIBUTIONS else uniform
+            strategies[name] = Strategy(distribution, SELECTORS.get(name, Selector)(settings))
     return strategies
