@@ -12,7 +12,7 @@ import pytest
 
 from edge_se_sampler.bench.baselines import run as run_module
 from edge_se_sampler.bench.baselines.results import BaselineSettings, read_baselines
-from edge_se_sampler.bench.baselines.run import Clock, Task, TimeIsUp, mean_psnr, train
+from edge_se_sampler.bench.baselines.run import Clock, TimeIsUp, mean_psnr, train
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.errors import InputError
@@ -154,7 +154,7 @@ def test_a_program_whose_evaluation_needs_a_gpu_is_evaluated_without(
 ) -> None:
     monkeypatch.setattr(run_module, "BASELINE_EVAL_SECONDS", ())
     settings = BaselineSettings(seconds=0.2, threads=2, program="tensorf", program_version="1", flags="")
-    run = train(Task(settings, checkout(tmp_path / "program", "train.py", TENSORF), data, seed=0))
+    run = train(settings, checkout(tmp_path / "program", "train.py", TENSORF), data, seed=0)
     ((_, psnr),) = run["curve"]
     assert psnr == pytest.approx(mean_psnr([np.ones((24, 24, 3), np.float32)], data), abs=1e-3)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import re
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -35,27 +36,27 @@ class BenchBaselines(ChartOptions):
         Raises:
             InputError: the program is not there, refuses its flags or ends too soon, or the json is of other settings.
         """
-        from edge_se_sampler.bench.baselines.results import BaselineSettings, path_of
-        from edge_se_sampler.bench.baselines.run import Task, Trial, train, version_of
-        from edge_se_sampler.bench.runner import load_or_create, pending, run_in_subprocess, write_result
-        from edge_se_sampler.engine.files import check_output, make_folder
+        from edge_se_sampler.bench.baselines.results import BaselineSettings
+        from edge_se_sampler.bench.baselines.run import train, version_of
+        from edge_se_sampler.bench.runner import load_or_create, run_in_subprocess, write_result
+        from edge_se_sampler.engine.files import make_folder
 
         settings = BaselineSettings(
             **vars(self.settings()), program=self.program, label=self.label, flags=self.flags,
             program_version=version_of(self.checkout),
         )  # fmt: skip
-        path = path_of(settings, self.output_dir)
+        path = self.output_dir / "baselines" / f"{'-'.join(re.findall(r'[A-Za-z0-9.]+', settings.name))}.json"
         make_folder(path.parent, "--output-dir")
-        check_output(path, "--output-dir")
         result = load_or_create(path, "baselines", settings)
-        trials = [Trial(scene, seed) for seed, scene in product(self.seeds, self.scenes)]
-        for trial in pending(trials, result):
-            task = Task(settings, self.checkout, self.scene_folder(trial.scene).resolve(), trial.seed)
+        for seed, scene in product(self.seeds, self.scenes):
+            if any((run["scene"], run["seed"]) == (scene, seed) for run in result["runs"]):
+                continue
+            data = self.scene_folder(scene).resolve()
             try:
-                run = run_in_subprocess(train, task)
+                run = run_in_subprocess(train, settings, self.checkout, data, seed)
             except RuntimeError as problem:
-                raise InputError(f"{settings.name} on {trial.scene}, seed {trial.seed}: {problem}") from None
-            result["runs"].append({**asdict(trial), **run})
+                raise InputError(f"{settings.name} on {scene}, seed {seed}: {problem}") from None
+            result["runs"].append({"scene": scene, "seed": seed, **run})
             write_result(path, result)
         for run in result["runs"]:
             seconds, psnr = run["curve"][-1]

@@ -8,36 +8,27 @@ mean over the same test views.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.chart.trials import ChartSettings
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.runner import read_result
 from edge_se_sampler.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineSettings(ChartSettings):
-    """What was run, and how."""
+    """What was run, and how: the flags of `edge-se bench baselines`."""
 
     program: str
     label: str = ""
-    """What distinguishes these flags from others, in pictures and tables."""
     program_version: str
     flags: str
-    """The program's own, besides those that name the data."""
 
     @property
     def name(self) -> str:
-        """Program and label."""
         return f"{self.program}, {self.label}" if self.label else self.program
-
-
-def path_of(settings: BaselineSettings, folder: Path) -> Path:
-    """Where a baseline's result lies in a chart's folder."""
-    return folder / "baselines" / f"{'-'.join(re.findall(r'[A-Za-z0-9.]+', settings.name))}.json"
 
 
 def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str, Any]]:
@@ -52,7 +43,10 @@ def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str,
         try:
             found = BaselineSettings(**result["settings"])
             for run in result["runs"]:
-                _check_curve(run)
+                scene, seed, (times, psnr) = run["scene"], run["seed"], zip(*run["curve"], strict=True)
+                ascending = list(times) == sorted(times) and times[0] > 0
+                if not (isinstance(scene, str) and ascending and all(map(math.isfinite, psnr))):
+                    raise ValueError(f"the curve of {scene}, seed {seed}, is not ascending seconds and PSNR")
         except (ValueError, KeyError, TypeError) as problem:
             raise InputError(f"{path}: not a result of edge-se bench baselines ({problem!r})") from problem
         for key in ("threads", "image_size"):
@@ -61,11 +55,3 @@ def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str,
                 raise InputError(f"{path}: {key} is {value}, the chart's is {expected}: seconds cannot be compared")
         baselines[f"{found.name} ({found.program_version})"] = result
     return baselines
-
-
-def _check_curve(run: Run) -> None:
-    scene, seed, curve = run["scene"], run["seed"], run["curve"]
-    times = [seconds for seconds, _ in curve]
-    finite = all(math.isfinite(psnr) for _, psnr in curve)
-    if not (isinstance(scene, str) and curve and finite and times == sorted(times) and times[0] > 0):
-        raise ValueError(f"the curve of {scene}, seed {seed}, is not ascending seconds and PSNR")

@@ -1,9 +1,8 @@
 """Other programs, run unchanged on the chart's scenes by the chart's clock.
 
-A program is imported from a checkout of its own, or from this environment. Its training loop calls something of ours
-after every step (in the place of its evaluation, which it is made to call each time, or as a callback): there the clock
-stands still, the test views are evaluated when an evaluation is due, and the program is stopped when its time is up.
-The clock starts when it begins to read the data, as it does for our trainings.
+A program is imported from a checkout of its own, or from this environment. Its training loop calls the clock after
+every step (in the place of its evaluation, which it is made to call each time, or as a callback). The clock starts when
+the program begins to read the data, as it does for our trainings.
 """
 # pyright: reportMissingImports=false
 # no environment that is linted has the programs
@@ -19,8 +18,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -77,44 +76,32 @@ class Clock:
         self._start += self.settings.clock() - now
 
 
-@dataclass(frozen=True)
-class Trial:
-    """What identifies a training in its json."""
-
-    scene: str
-    seed: int
-
-
-@dataclass(frozen=True)
-class Task:
-    """What a program is given."""
-
-    settings: BaselineSettings
-    checkout: Path | None
-    """None where this environment has the program."""
-    data: Path
-    seed: int
-
-
-def train(task: Task) -> Run:
+def train(settings: BaselineSettings, checkout: Path | None, data: Path, seed: int) -> Run:
     """Steps and curve of a training; to be called in a fresh process, because programs change what is global.
+
+    Args:
+        checkout: None where this environment has the program.
 
     Raises:
         InputError: the program is not there, refuses its flags or ends too soon.
     """
-    settings = task.settings
     torch.set_num_threads(settings.threads)
     clock = Clock(settings)
-    if task.checkout is not None:
-        sys.path.insert(0, str(task.checkout.resolve()))
+    if checkout is not None:
+        sys.path.insert(0, str(checkout.resolve()))
     try:
-        with silent_folder() as folder:
-            PROGRAMS[settings.program](task, folder, clock)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            open(os.devnull, "w") as null,
+            contextlib.redirect_stdout(null),
+            contextlib.redirect_stderr(null),
+        ):
+            PROGRAMS[settings.program](clock, data, Path(folder), seed, shlex.split(settings.flags))
     except TimeIsUp:
         return {"steps": clock.steps, "curve": clock.curve}
     except (Exception, SystemExit) as problem:  # whatever another program raises
         raise InputError(
-            f"{settings.program} with --checkout {task.checkout}, flags {settings.flags!r}: "
+            f"{settings.program} with --checkout {checkout}, flags {settings.flags!r}: "
             f"{type(problem).__name__}: {problem}"
         ) from None
     raise InputError(
@@ -123,40 +110,28 @@ def train(task: Task) -> Run:
     )
 
 
-@contextlib.contextmanager
-def silent_folder() -> Iterator[Path]:
-    """A temporary folder for what a program writes; it prints nothing."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        open(os.devnull, "w") as null,
-        contextlib.redirect_stdout(null),
-        contextlib.redirect_stderr(null),
-    ):
-        yield Path(folder)
-
-
-def _nerf_pytorch(task: Task, folder: Path, clock: Clock) -> None:
+def _nerf_pytorch(clock: Clock, data: Path, folder: Path, seed: int, flags: list[str]) -> None:
     """github.com/yenchenlin/nerf-pytorch with its flags for Blender scenes: the renderings of the test set that its
     flags order after every step are evaluated instead of written."""
     program: Any = importlib.import_module("run_nerf")
     render_path = program.render_path
 
     def evaluate(*args: Any, **kwargs: Any) -> None:
-        clock.after_step(lambda: mean_psnr(render_path(*args, **(kwargs | {"savedir": None}))[0], task.data))
+        clock.after_step(lambda: mean_psnr(render_path(*args, **(kwargs | {"savedir": None}))[0], data))
 
     program.render_path = evaluate
     sys.argv = [
-        "run_nerf.py", "--expname", "run", "--basedir", str(folder), "--datadir", str(task.data),
+        "run_nerf.py", "--expname", "run", "--basedir", str(folder), "--datadir", str(data),
         "--dataset_type", "blender", "--testskip", "1", "--precrop_iters", "500", "--no_batching", "--use_viewdirs",
         "--white_bkgd", "--lrate_decay", "500", "--N_samples", "64", "--N_importance", "128", "--N_rand", "1024",
-        "--i_testset", "1", "--i_weights", NEVER, "--i_video", NEVER, *shlex.split(task.settings.flags),
+        "--i_testset", "1", "--i_weights", NEVER, "--i_video", NEVER, *flags,
     ]  # fmt: skip
-    _seed(task.seed)
+    _seed(seed)
     clock.start()
     program.train()
 
 
-def _tensorf(task: Task, folder: Path, clock: Clock) -> None:
+def _tensorf(clock: Clock, data: Path, folder: Path, seed: int, flags: list[str]) -> None:
     """github.com/apchenstu/TensoRF with its configs/lego.txt. Its evaluation needs a GPU: its renderer is called."""
     program: Any = importlib.import_module("train")
 
@@ -165,47 +140,46 @@ def _tensorf(task: Task, folder: Path, clock: Clock) -> None:
 
         def psnr() -> float:
             rows = [renderer(rays.reshape(-1, 6), model, N_samples=N_samples, device="cpu") for rays in views.all_rays]
-            return mean_psnr([row[0].reshape(height, width, 3).numpy() for row in rows], task.data)
+            return mean_psnr([row[0].reshape(height, width, 3).numpy() for row in rows], data)
 
         clock.after_step(psnr)
         return [0.0]
 
     program.evaluation = evaluate
-    downsampling = 800 / to_pictures(read_blender(task.data, "test"))[0].image.shape[1]
+    downsampling = 800 / to_pictures(read_blender(data, "test"))[0].image.shape[1]
     sys.argv = [
         "train.py", "--config", str(Path(str(program.__file__)).parent / "configs" / "lego.txt"),
-        "--datadir", str(task.data), "--basedir", str(folder), "--downsample_train", str(downsampling),
-        "--vis_every", "1", *shlex.split(task.settings.flags),
+        "--datadir", str(data), "--basedir", str(folder), "--downsample_train", str(downsampling),
+        "--vis_every", "1", *flags,
     ]  # fmt: skip
-    _seed(task.seed)
+    _seed(seed)
     arguments = program.config_parser()
     clock.start()
     program.reconstruction(arguments)
 
 
-def _nerfstudio(task: Task, folder: Path, clock: Clock) -> None:
+def _nerfstudio(method: str, clock: Clock, data: Path, folder: Path, seed: int, flags: list[str]) -> None:
     """A method of nerfstudio's as ns-train has it."""
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
     from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
 
-    method, flags = task.settings.program.removeprefix("nerfstudio-"), shlex.split(task.settings.flags)
-    config = build_config(method, task.seed, task.data, folder, flags)
+    config = build_config(method, seed, data, folder, flags)
     clock.start()
     trainer = build_trainer(config, "test")
 
     def evaluate(step: int) -> None:
-        clock.after_step(lambda: mean_psnr(render_test_views(trainer), task.data))
+        clock.after_step(lambda: mean_psnr(render_test_views(trainer), data))
 
     trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], evaluate))
     trainer.train()
 
 
-PROGRAMS: dict[str, Callable[[Task, Path, Clock], None]] = {
+PROGRAMS: dict[str, Callable[[Clock, Path, Path, int, list[str]], None]] = {
     "nerf-pytorch": _nerf_pytorch,
     "tensorf": _tensorf,
-    "nerfstudio-vanilla-nerf": _nerfstudio,
-    "nerfstudio-nerfacto": _nerfstudio,
+    "nerfstudio-vanilla-nerf": partial(_nerfstudio, "vanilla-nerf"),
+    "nerfstudio-nerfacto": partial(_nerfstudio, "nerfacto"),
 }
 
 

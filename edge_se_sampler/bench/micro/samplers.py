@@ -25,7 +25,6 @@ from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.ranking import sample_by_rank
 
-EPSILON = np.float32(0.01)
 MEMORY_RAYS = 1024
 
 
@@ -61,10 +60,9 @@ def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:
     noise = [np.random.default_rng(i).integers(0, 256, (size, size, 4), dtype=np.uint8) for i in range(min(images, 8))]
     table = PixelTable()
     memory_before, start = resident_memory(), time.perf_counter()
-    edges = in_threads(lambda i: torch.from_numpy(edge_strength(noise[i % len(noise)]) + EPSILON), range(images))
-    table.add(edges)
-    seconds = time.perf_counter() - start
-    pixels = images * size * size
+    floor = np.float32(0.01)
+    table.add(in_threads(lambda i: torch.from_numpy(edge_strength(noise[i % len(noise)]) + floor), range(images)))
+    seconds, pixels = time.perf_counter() - start, images * size * size
     return table, {
         "build_seconds": seconds,
         "bytes_per_pixel": table.nbytes / pixels,
@@ -93,13 +91,7 @@ def _training_peak(method: str, changes: dict[str, Any]) -> int:
 
 
 def late_phase(rays: int, size: str, error_source: str) -> dict[str, Any]:
-    """Changes of a config (`override`): no early phase.
-
-    Args:
-        rays: pixels per step.
-        size: of the networks, as `--pipeline.model.size`.
-        error_source: of squared errors, where the method samples by them.
-    """
+    """Changes of a config (`override`) for training without an early phase, with so many pixels per step."""
     return {
         f"{SAMPLER}.early_fraction": 0.0,
         f"{SAMPLER}.error_source": error_source,

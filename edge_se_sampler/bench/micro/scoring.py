@@ -25,8 +25,6 @@ from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.strategies import RankedError
 
 ERROR_SOURCES = ("fine", "coarse", "cached")
-NUM_RANKED = 4096
-"""Pixels whose scores are ranked."""
 
 
 def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
@@ -50,7 +48,7 @@ def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iter
 
         trainers = {name: build_trainer(*method) for name, method in methods.items()}
         milliseconds = median_milliseconds({name: each.train_iteration for name, each in trainers.items()}, rounds)
-        trainer = build_trainer("se-nerf", "cached")
+        trainer = build_trainer(*methods["cached"])
         with Progress(iterations, "training") as progress:
             for step in range(iterations):
                 trainer.train_iteration(step)
@@ -62,24 +60,18 @@ def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iter
 
 
 def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
-    """Spearman's correlation of coarse and cached scores with the fine ones, over pixels drawn uniformly.
-
-    Args:
-        trainer: whose pixel sampler caches errors.
-        step: that the cached errors are looked up at.
-    """
+    """Spearman's correlation of coarse and cached scores with the fine ones, over pixels drawn uniformly; cached errors
+    are looked up at a step."""
     manager, model = trainer.pipeline.datamanager, trainer.pipeline.model
     sampler, images = manager.train_pixel_sampler, manager.image_batch["image"]
     ranked = sampler.strategies["se"].selector
     assert isinstance(ranked, RankedError)
     assert ranked.error_map is not None
     rng = np.random.default_rng(0)
-    numbers = rng.integers(len(images), size=NUM_RANKED)
-    pixels = [(n, *rng.integers(images[n].shape[:2])) for n in numbers.tolist()]
+    pixels = [(n, *rng.integers(images[n].shape[:2])) for n in rng.integers(len(images), size=4096).tolist()]
     indices = torch.tensor(pixels)
-    rays = manager.cameras.pixel_rays(indices)
     image = torch.stack([images[n][row, column] for n, row, column in pixels]).float() / 255
-    outputs = render_outputs(model, rays, ("background", "rgb_fine", "rgb_coarse"))
+    outputs = render_outputs(model, manager.cameras.pixel_rays(indices), ("background", "rgb_fine", "rgb_coarse"))
     fine, coarse = (model.squared_error(outputs, image, network).numpy() for network in ("fine", "coarse"))
     cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)
     spearman = require_scipy_stats().spearmanr
