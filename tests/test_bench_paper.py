@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.bench import runner
-from edge_se_sampler.bench.paper.published import SCENES, published
+from edge_se_sampler.bench.paper.published import LABELS, SCENES, published
 from edge_se_sampler.bench.paper.report import psnr_table
 from edge_se_sampler.bench.paper.trials import (
     PAPER_TABLES,
@@ -29,7 +29,6 @@ from edge_se_sampler.bench.paper.trials import (
     run_trial,
     synthetic_scene,
 )
-from edge_se_sampler.bench.strategies import LABELS
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.run_folder import config_from_json, config_to_json

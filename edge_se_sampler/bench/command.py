@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +36,7 @@ class ExperimentCommand(ABC):
 
     @abstractmethod
     def experiment(self) -> Experiment:
-        """What is trained.
-
-        Raises:
-            InputError: a flag's value has no meaning.
-        """
+        """What is trained; InputError if a flag's value has no meaning."""
 
     def run(self) -> None:
         """Train and report.
@@ -65,7 +62,10 @@ class ExperimentCommand(ABC):
         write_report(self.output_dir, workplace=self.workplace)
 
     def default_workers(self) -> int:
-        """How many trainings at once if --workers is left out."""
-        from edge_se_sampler.bench.runner import default_workers
+        """How many trainings at once if --workers is left out: as many as CPUs that this process may use; a GPU is one
+        worker's."""
+        import torch
 
-        return default_workers()
+        if torch.cuda.is_available():
+            return 1
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

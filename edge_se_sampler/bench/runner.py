@@ -19,8 +19,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.engine.files import make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
@@ -75,7 +73,7 @@ def run_experiment(experiment: Experiment, output_dir: Path, new_executor: Execu
         _run_trials(experiment, trials, result, path, new_executor)
         trials = experiment.trials(result["runs"])
     for error in result["errors"]:
-        print(", ".join(str(value) for value in error.values()))
+        print(*error.values(), sep=", ")
     print(f"{len(result['runs'])} trainings; see {output_dir / 'README.md'}")
     return result
 
@@ -107,11 +105,7 @@ def _command() -> str:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A result.json.
-
-    Raises:
-        InputError: it cannot be read, or is no result of this version.
-    """
+    """A result.json; InputError if it cannot be read, or is no result of this version."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
         if result["version"] != VERSION:
@@ -126,11 +120,7 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
-    """result.json, every run on a line of its own.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """result.json, every run on a line of its own; InputError if it cannot be written."""
     head = json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=1, allow_nan=False)
     runs = ",\n".join(json.dumps(run, allow_nan=False) for run in result["runs"])
     write_atomically(path, f'{head[:-2]},\n "runs": [\n{runs}\n ]\n}}\n'.encode())
@@ -203,19 +193,9 @@ def executor_factory(workers: int, scheduler: str | None) -> ExecutorFactory:
     return client.get_executor
 
 
-def default_workers() -> int:
-    """As many as CPUs that this process may use; a GPU is one worker's."""
-    if torch.cuda.is_available():
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def run_in_subprocess(function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function returns in a fresh process, whose memory and global state are its own.
-
-    Raises:
-        RuntimeError: that process was killed.
-    """
+    """What a function returns in a fresh process, whose memory and global state are its own; RuntimeError if that was
+    killed."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _exit_with_parent) as executor:
         try:
             return executor.submit(function, *arguments).result()
@@ -231,6 +211,5 @@ def _initialize_worker() -> None:
 
 def _exit_with_parent() -> None:
     """If the process that hands out the trials is killed, its workers end too instead of waiting for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
+    if parent := multiprocessing.parent_process():
         threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

@@ -19,7 +19,7 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
     Raises:
         InputError: an unknown scene or option value, or a folder that cannot be written.
     """
-    words = [f"{key}-{value}" for key, value in sorted(options.items()) if key != "progress"]
+    words = [f"{key}-{value}" for key, value in sorted(options.items())]
     folder = workplace / "scenes" / ("_".join(words) or "default")
     if not (folder / name).exists():
         with Progress(0, f"rendering {name}") as progress:

@@ -20,11 +20,7 @@ POWER = 0.8
 
 
 def require_scipy_stats() -> Any:
-    """scipy.stats.
-
-    Raises:
-        InputError: the [bench] extra is missing.
-    """
+    """scipy.stats; InputError if the [bench] extra is missing."""
     try:
         from scipy import stats
     except ImportError:
@@ -43,16 +39,16 @@ class PairedDifference:
     """A mean difference over these scenes, its 95 % interval over seeds, and what so many runs could have shown."""
 
     mean: float
-    low: float | None
-    high: float | None
-    """None: a single seed, or too few runs, say nothing of the deviation."""
-    detectable: float | None
-    """A true difference of this size is found with 80 % power."""
     runs: int
     """Pairs."""
     scenes_better: int
     """Scenes whose mean difference is above 0."""
     scenes: int
+    low: float | None = None
+    high: float | None = None
+    """None: a single seed, or too few runs, say nothing of the deviation."""
+    detectable: float | None = None
+    """A true difference of this size is found with 80 % power."""
 
 
 def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDifference:
@@ -65,24 +61,24 @@ def paired_difference(differences: Iterable[tuple[str, float]]) -> PairedDiffere
     for scene, difference in differences:
         by_scene.setdefault(scene, []).append(difference)
     if not by_scene:
-        return PairedDifference(0.0, None, None, None, 0, 0, 0)
+        return PairedDifference(0.0, 0, 0, 0)
     means = {scene: statistics.mean(values) for scene, values in by_scene.items()}
     mean, runs = statistics.mean(means.values()), sum(map(len, by_scene.values()))
-    better = sum(value > 0 for value in means.values())
+    counts = (runs, sum(value > 0 for value in means.values()), len(means))
     df = runs - len(means)
     if df < 4:
-        return PairedDifference(mean, None, None, None, runs, better, len(means))
+        return PairedDifference(mean, *counts)
     variance = sum((d - means[scene]) ** 2 for scene, values in by_scene.items() for d in values) / df
     error = math.sqrt(variance * sum(1 / len(values) for values in by_scene.values())) / len(means)
     t = require_scipy_stats().t(df)
     reach = float(t.ppf(0.5 + CONFIDENCE / 2))
     detectable = (reach + float(t.ppf(POWER))) * error
-    return PairedDifference(mean, mean - reach * error, mean + reach * error, detectable, runs, better, len(means))
+    return PairedDifference(mean, *counts, mean - reach * error, mean + reach * error, detectable)
 
 
 def format_difference(difference: PairedDifference) -> str:
     """The mean with its interval, where there is one."""
     if not difference.runs:
         return "–"
-    known = difference.low is not None
-    return f"{difference.mean:+.2f}" + (f" [{difference.low:+.2f}, {difference.high:+.2f}]" if known else "")
+    interval = "" if difference.low is None else f" [{difference.low:+.2f}, {difference.high:+.2f}]"
+    return f"{difference.mean:+.2f}{interval}"

@@ -21,8 +21,6 @@ from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 
-MEASURES = ("psnr", "foreground_psnr", "edge_band_psnr", "background_mse")
-
 
 def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> Run:
     """Train a config on one thread, and measure it on its test views.
@@ -53,7 +51,7 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
     metrics, every = trainer.run.metrics(), trainer.config.steps_per_log
     drawn = [line for line in metrics if "strategy" in line]
     return {
-        **{key: results[key] for key in MEASURES},
+        **{key: results[key] for key in ("psnr", "foreground_psnr", "edge_band_psnr", "background_mse")},
         **measure_outcome(results, pictures, model.config.background_level),
         "dead_at_start": dead,
         "reinitialized": sum("reinitialized" in line for line in metrics),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER
-from edge_se_sampler.bench.strategies import LABELS
+from edge_se_sampler.bench.paper.published import LABELS
 
 RECOMMENDED = "lean"
 """Every group is compared with this variant."""

@@ -15,10 +15,9 @@ import imageio.v3 as iio
 import numpy as np
 
 from edge_se_sampler.bench.outcomes import failed
-from edge_se_sampler.bench.paper.published import SCENES
+from edge_se_sampler.bench.paper.published import LABELS, SCENES
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, TABLES, Trial, runs_by_trial
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.strategies import LABELS
 from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_axes
 from edge_se_sampler.engine.metrics import composite_on, edge_band
 from edge_se_sampler.sampling.edges import unit_float

@@ -1,12 +1,20 @@
-"""The paper's tables 1 to 4: PSNR in dB on NeRF's Blender scenes, one seed. Its averages are truncated and left out.
+"""The paper's strategies, and its tables 1 to 4: PSNR in dB on NeRF's Blender scenes, one seed; not its averages, which
+are truncated.
 
 Important Pixels Sampling for NeRF Training Based on Edge Values and Squared Errors, section 4.
 """
 
 from __future__ import annotations
 
-from edge_se_sampler.bench.strategies import LABELS
-
+LABELS = {
+    "vanilla-nerf": "Random",
+    "precrop-nerf": "Precrop + Random",
+    "se-nerf": "SE",
+    "precrop-se-nerf": "Precrop + SE",
+    "edge-nerf": "Edge",
+    "edge-se-nerf": "Edge + SE",
+}
+"""Method -> label, in the order of the paper's tables."""
 SCENES = ("chair", "drums", "ficus", "hotdog", "bricks", "materials", "mic")
 """Its columns under the names of the synthetic scenes; bricks stands in for Lego."""
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER, override
-from edge_se_sampler.bench.paper.published import SCENES
+from edge_se_sampler.bench.paper.published import LABELS, SCENES
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.scenes import cached_scene
-from edge_se_sampler.bench.strategies import LABELS
 from edge_se_sampler.bench.train import train_and_measure
 from edge_se_sampler.data.blender import has_split, read_blender
 from edge_se_sampler.data.offcenter import offcenter

@@ -11,10 +11,10 @@ from itertools import groupby
 from typing import Any, Literal, get_args
 
 from edge_se_sampler.bench.outcomes import failed
+from edge_se_sampler.bench.paper.published import LABELS
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, Trial, runs_by_trial
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.statistics import PairedDifference, paired_difference
-from edge_se_sampler.bench.strategies import LABELS
 
 MIN_SEEDS = 3
 """Runs of a scene that it takes to say that most of them fail."""

@@ -41,22 +41,13 @@ class LengthComparison:
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
-    """Draw lengths.png, if there are runs for it.
-
-    Raises:
-        InputError: the result cannot be read, matplotlib is missing, or the file cannot be written.
-    """
-    comparisons = compare_lengths(read_result(folder / "result.json")["runs"])
-    if comparisons:
+    """Draw lengths.png, if there are runs for it."""
+    if comparisons := compare_lengths(read_result(folder / "result.json")["runs"]):
         save_figure(_draw_lengths(comparisons), folder / "lengths.png")
 
 
 def describe(folder: Path) -> str:
-    """The README.md of a folder with a result.json.
-
-    Raises:
-        InputError: the result cannot be read.
-    """
+    """The README.md of a folder with a result.json."""
     result = read_result(folder / "result.json")
     parts = _describe_failures(result["runs"]) | _describe_lengths(compare_lengths(result["runs"]))
     return fill_template(__file__, folder, **parts, reproduce=describe_command(result))
@@ -101,8 +92,8 @@ def _describe_failures(runs: list[Run]) -> dict[str, Any]:
     trained = [run for run in runs if run["part"] == "failures"]
     rows = []
     for table in CONFIGURATIONS:
-        by_scene = {scene: [pair for key, pair in pairs.items() if key[:2] == (table, scene)] for scene in SCENES}
-        rows.append([TABLES[table].title, *map(_count_failures, by_scene.values())])
+        by_scene = [[pair for key, pair in pairs.items() if key[:2] == (table, scene)] for scene in SCENES]
+        rows.append([TABLES[table].title, *map(_count_failures, by_scene)])
     return {
         "iterations": trained[0]["iterations"],
         "failure_rule": FAILURE_RULE,
@@ -129,16 +120,8 @@ def _describe_lengths(comparisons: list[LengthComparison]) -> dict[str, Any]:
         [f"{c.iterations:,}", c.best, format_difference(c.summary), str(c.summary.runs), verdicts[c.not_inferior]]
         for c in comparisons
     ]
-    longest = all(comparison.best == SHARES[-1] for comparison in comparisons)
-    return {
-        "shares": ", ".join(SHARES),
-        "margin": MARGIN,
-        "comparisons": markdown_table(
-            ["iterations", "best fixed share", "adaptive against it", "pairs", "not inferior"], rows
-        ),
-        "longest": "The longest share is the best at every length: edges pay for longer than the paper's tenth."
-        * longest,
-    }
+    head = ["iterations", "best fixed share", "adaptive against it", "pairs", "not inferior"]
+    return {"shares": ", ".join(SHARES), "margin": MARGIN, "comparisons": markdown_table(head, rows)}
 
 
 def _draw_lengths(comparisons: list[LengthComparison]) -> Any:

@@ -98,12 +98,10 @@ def score_shares(runs: list[Run]) -> dict[int, dict[str, float]]:
 
 
 def best_share(scores: dict[str, float]) -> str:
-    """The fixed share with the highest score."""
     return max(scores, key=scores.__getitem__)
 
 
 def build_config(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
-    """What a trial trains."""
     strategy = "vanilla-nerf" if trial.arm == "random" else "edge-se-nerf"
     settings = replace(paper.PRESETS["cpu"], iterations=trial.iterations)
     paper_trial = paper.Trial(trial.table, trial.scene, strategy, trial.seed)

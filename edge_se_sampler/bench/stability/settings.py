@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from edge_se_sampler.bench.overrides import SAMPLER
-from edge_se_sampler.bench.strategies import LABELS
+from edge_se_sampler.bench.paper.published import LABELS
 
 Background = Literal["white", "black", "grey", "green", "random", "textured"]
 
