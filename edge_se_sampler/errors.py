@@ -7,11 +7,7 @@ from contextlib import contextmanager
 
 
 class InputError(ValueError):
-    """A flag, file or argument cannot be used.
-
-    The message is one line: what is wrong, where (file and field), and what to do. The command line prints it on
-    stderr and exits with code 2.
-    """
+    """A flag, file or argument cannot be used: one line that says what is wrong, where, and what to do. Exit code 2."""
 
 
 def check_known(flag: str, names: Sequence[object], known: Iterable[object]) -> None:

@@ -71,16 +71,18 @@ def read_blender(folder: Path, split: Split) -> Views:
     """Read one split of a scene; files that no frame lists are ignored.
 
     Poses are returned as written (not moved, scaled or orthonormalized). A frame without mask_path is trained on as a
-    whole.
-
-    Raises:
-        InputError: in one line, anything that cannot be used: first of the folder, then of the json and the paths it
-            lists, and only then of the images.
+    whole. InputError for anything that cannot be used: first of the folder, then of the json, then of the images.
     """
     folder = Path(folder)
     _check_folder(folder, split)
     top = read_json(transforms_path(folder, split))
-    frames = _read_frames(top, folder)
+    hint = "list each view as {file_path, transform_matrix}"
+    listed = top.required("frames", hint)
+    entries = listed.list()
+    if not entries:
+        raise listed.location.error("is empty", hint)
+    shared = _read_intrinsics(top)
+    frames = [_read_frame(entry, shared, folder) for entry in entries]
     half_tan = _read_half_tan(top, frames)
     _check_distinct([frame.image for frame in frames])
     with ThreadPoolExecutor() as pool:  # decoding releases Python's lock
@@ -89,13 +91,11 @@ def read_blender(folder: Path, split: Split) -> Views:
         mask_files = [frame.mask for frame in frames]
         masks = tuple(pool.map(_read_mask, mask_files, images)) if any(mask_files) else None
     if masks is not None and not any(mask.any() for mask in masks):
-        hint = "masks are non-zero where to train"
-        raise top.location.member("frames").error("all pixels of all views are masked", hint)
+        raise listed.location.error("all pixels of all views are masked", "masks are non-zero where to train")
     return Views(tuple(frame.file_path for frame in frames), images, masks, _cameras(frames, images, half_tan))
 
 
 def _check_folder(folder: Path, split: str) -> None:
-    """Raise InputError unless `folder` is a folder that has the split."""
     location = SourceLocation(folder)
     hint = "give the folder that has the transforms_*.json files"
     if not os.path.lexists(folder):
@@ -110,16 +110,6 @@ def _check_folder(folder: Path, split: str) -> None:
     others = f"only {found}" if found else "nor that of any other split"
     hint = "a Blender scene has transforms_train.json and, for other splits, transforms_val.json, transforms_test.json"
     raise location.error(f"has no {transforms_path(folder, split).name}, {others}", hint)
-
-
-def _read_frames(top: JsonValue, folder: Path) -> list[_Frame]:
-    hint = "list each view as {file_path, transform_matrix}"
-    frames = top.required("frames", hint)
-    entries = frames.list()
-    if not entries:
-        raise frames.location.error("is empty", hint)
-    shared = _read_intrinsics(top)
-    return [_read_frame(entry, shared, folder) for entry in entries]
 
 
 def _read_frame(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) -> _Frame:
@@ -149,7 +139,7 @@ def _read_intrinsics(parent: JsonValue) -> dict[str, JsonValue]:
 
 
 def _read_pose(matrix: JsonValue) -> np.ndarray:
-    """The upper (3, 4) float64 of a rigid camera-to-world matrix; InputError for anything else."""
+    """The upper (3, 4) float64 of a rigid camera-to-world matrix."""
     rows = matrix.list()
     if len(rows) != 4 or any(not isinstance(row.value, list) or len(row.value) != 4 for row in rows):
         problem = f"must be 4 rows of 4 numbers, not {quote(matrix.value)}"
@@ -191,7 +181,6 @@ def _locate(name: JsonValue, folder: Path) -> SourceFile:
 
 
 def _check_distinct(files: Sequence[SourceFile]) -> None:
-    """Raise InputError if two frames have one image."""
     first: dict[Path, SourceFile] = {}
     for file in files:
         other = first.setdefault(file.path, file)

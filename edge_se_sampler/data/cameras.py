@@ -16,8 +16,6 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RayBundle:
-    """n rays."""
-
     origins: Tensor  # (n, 3) world units
     directions: Tensor  # (n, 3) unit vectors
     camera_indices: Tensor  # (n, 1) int64
@@ -71,7 +69,6 @@ class Cameras:
         return len(self.camera_to_worlds)
 
     def __getitem__(self, indices: slice | Sequence[int]) -> Cameras:
-        """The cameras of these indices, in this order."""
         return Cameras(**{key: value[indices] for key, value in vars(self).items()})
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
@@ -79,12 +76,7 @@ class Cameras:
         return Cameras(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in vars(self).items()})
 
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
-        """One ray for each coordinate.
-
-        Args:
-            camera_indices: (n, 1) int64.
-            coords: (n, 2) float: y, x in pixels (a pixel's center is its row + 0.5, column + 0.5).
-        """
+        """A ray through each of coords (n, 2), float y, x in pixels, of the cameras (n, 1) int64."""
         c = camera_indices[:, 0]
         x = (coords[:, 1:] - self.cx[c]) / self.fx[c]
         y = -(coords[:, :1] - self.cy[c]) / self.fy[c]
@@ -107,9 +99,8 @@ class Cameras:
     def project(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
         """Where one camera sees points (m, 3) in world units: the inverse of `generate_rays`.
 
-        Returns:
-            coords (m, 2): y, x in pixels, without meaning for points that are not in front of the camera.
-            depth (m,): along the optical axis, world units; positive in front of the camera.
+        Returns coords (m, 2), y, x in pixels, which mean nothing behind the camera, and the depth (m,) along the
+        optical axis in world units, positive in front of the camera.
         """
         pose = self.camera_to_worlds[camera]
         right, up, back = pose[:, :3].T @ (points - pose[:, 3]).T

@@ -38,9 +38,7 @@ class VanillaDataManager:
         device: torch.device | str = "cpu",
         background_color: tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:
-        self.config = config
-        self.device = device
-        self.image_batch = image_batch(views)
+        self.config, self.device, self.image_batch = config, device, image_batch(views)
         self.cameras = views.cameras.to(device, torch.float32)
         # a host's sampler may write into its config
         self.train_pixel_sampler = copy.copy(config.pixel_sampler).setup(
@@ -86,13 +84,9 @@ class VanillaDataManager:
         sampler, trainer = self.train_pixel_sampler, training_callback_attributes.trainer
         if not isinstance(sampler, ImportantPixels):
             return []
-        sampler.bind(
-            squared_error=build_scorer(
-                sampler, training_callback_attributes.pipeline, self.cameras.pixel_rays, self.ray_errors
-            ),
-            planned_steps=trainer.planned_steps,
-            seed=trainer.config.machine.seed,
-        )
+        pipeline = training_callback_attributes.pipeline
+        scorer = build_scorer(sampler, pipeline, self.cameras.pixel_rays, self.ray_errors)
+        sampler.bind(squared_error=scorer, planned_steps=trainer.planned_steps, seed=trainer.config.machine.seed)
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
 
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
@@ -118,14 +112,10 @@ def unit_interval(image: Tensor) -> Tensor:
 
 
 def image_batch(views: Views) -> dict[str, Any]:
-    """All views in nerfstudio's format.
+    """All views in nerfstudio's format; InputError if there are none.
 
-    Returns:
-        "image" (n, H, W, 3|4) uint8, "mask" (n, H, W, 1) bool if there are any, "image_idx" (n,) int64; lists of n
-        images and masks where sizes differ. Among RGBA images RGB ones get opaque alpha.
-
-    Raises:
-        InputError: no views.
+    "image" (n, H, W, 3|4) uint8, "mask" (n, H, W, 1) bool if there are any, "image_idx" (n,) int64; lists of n images
+    and masks where sizes differ. Among RGBA images RGB ones get opaque alpha.
     """
     if not views.images:
         raise InputError("there are no training views; transforms_train.json must list at least one frame")

@@ -22,11 +22,8 @@ _MODES = {"1": "RGB", "L": "RGB", "P": "RGB", "RGB": "RGB", "LA": "RGBA", "PA": 
 def read_image(file: SourceFile) -> np.ndarray:
     """The stored pixels, (H, W, 3|4) uint8, straight alpha: no gamma, no EXIF rotation.
 
-    Gray becomes RGB, a palette its colors, transparency of any kind an alpha channel.
-
-    Raises:
-        InputError: the file is missing, unreadable, empty, neither PNG nor JPEG, cut short, damaged, of 16 bits, of no
-            pixels, or of colors other than gray and RGB.
+    Gray becomes RGB, a palette its colors, transparency of any kind an alpha channel. InputError for a file that is
+    neither PNG nor JPEG, damaged, of 16 bits, of no pixels, or of colors other than gray and RGB.
     """
     data = file.read_bytes()
     if not data.startswith((_PNG, _JPEG)):

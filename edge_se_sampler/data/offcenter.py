@@ -94,11 +94,6 @@ def plain_background(image: np.ndarray) -> np.ndarray | None:
     return border[0] if np.all(border == border[0]) else None
 
 
-def object_mask(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """(H, W) bool: alpha above 0 for RGBA, other than the `background` color (3,) for RGB."""
-    return image[..., 3] > 0 if image.shape[2] == 4 else np.any(image != background, axis=-1)
-
-
 def offcenter(
     data: Path,
     out: Path,
@@ -110,23 +105,22 @@ def offcenter(
 
     Both show every picture on a canvas of the same size, bit for bit; only its position differs, and `cx`, `cy`. Around
     it is transparent black (RGBA), or the color of its border (RGB); masks hide what is around. Pictures are written
-    as PNG, a .jpg under the name .png; files that no frame lists are not copied.
+    as PNG, a .jpg under the name .png; files that no frame lists are not copied. Both folders appear together at the
+    end: an error or Ctrl-C leaves nothing behind.
 
     Args:
-        data: a folder as read_blender reads it.
-        out: a folder that is not there, or empty.
         shift: right and down positive; rounded to whole pixels, as the shifted synthetic scenes' offset is.
         pad: added on either side, rounded likewise; None: as much as the shift.
         progress: called as progress(done, total), in views.
-
-    Returns:
-        the two folders. They appear together at the end: an error or Ctrl-C leaves nothing behind.
 
     Raises:
         InputError: bad data, a fraction out of range, an `out` that cannot be written or is not empty, an RGB
             image without a plain border, or an object that would be cut off.
     """
-    _check_fractions(shift, pad)
+    if not all(-1 < fraction < 1 for fraction in shift):  # not so for NaN, too
+        raise InputError(f"shift is {shift}: give two numbers between -1 and 1, fractions of the image's size")
+    if pad is not None and not all(0 <= fraction <= 1 for fraction in pad):
+        raise InputError(f"pad is {pad}: give two numbers from 0 to 1, fractions of the image's size")
     data, target = Path(data), Path(os.path.abspath(out))
     with staged_folders(target.parent, [target]) as workspace, ThreadPoolExecutor() as pool:
         folder = workspace / target.name
@@ -147,13 +141,6 @@ def offcenter(
     return [target / copy for copy in COPIES]
 
 
-def _check_fractions(shift: Fractions, pad: Fractions | None) -> None:
-    if not all(-1 < fraction < 1 for fraction in shift):  # not so for NaN, too
-        raise InputError(f"shift is {shift}: give two numbers between -1 and 1, fractions of the image's size")
-    if pad is not None and not all(0 <= fraction <= 1 for fraction in pad):
-        raise InputError(f"pad is {pad}: give two numbers from 0 to 1, fractions of the image's size")
-
-
 def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Split, Files]:
     """The files of each split, all read to the end; InputError for what cannot be copied as promised."""
     plan: dict[Split, Files] = {}
@@ -170,7 +157,8 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
             if background is None:
                 problem = "has no plain background: the pixels of its border differ"
                 raise _image_error(frame, problem, "cut the object out (RGBA), or make the border one color")
-            canvas, foreground = Canvas.of(image, shift, pad), object_mask(image, background)
+            foreground = image[..., 3] > 0 if image.shape[2] == 4 else np.any(image != background, axis=-1)
+            canvas = Canvas.of(image, shift, pad)
             needed = np.maximum(needed, canvas.min_pad(foreground))
             if count := canvas.count_cut_off(foreground):
                 cut_off.append((frame, count))

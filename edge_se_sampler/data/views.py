@@ -21,13 +21,9 @@ class Views:
 
     def subset(self, indices: Sequence[int]) -> Views:
         """The views of these indices, in this order."""
-        chosen = list(indices)
-        return Views(
-            tuple(self.names[i] for i in chosen),
-            tuple(self.images[i] for i in chosen),
-            None if self.masks is None else tuple(self.masks[i] for i in chosen),
-            self.cameras[chosen],
-        )
+        masks = None if self.masks is None else tuple(self.masks[i] for i in indices)
+        names, images = zip(*((self.names[i], self.images[i]) for i in indices), strict=True)
+        return Views(names, images, masks, self.cameras[list(indices)])
 
     def with_masks(self, masks: Sequence[np.ndarray]) -> Views:
         """The same views, to be trained on only where both `masks` and the views' own, if any, are True."""

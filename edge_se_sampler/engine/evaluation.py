@@ -23,12 +23,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render every picture and compare all of its pixels, masked ones included.
 
-    Args:
-        on_view: called with index, picture and rendering (H, W, 3) of every view.
-
-    Returns:
-        the mean of every metric over the views, psnr_std, psnr_pooled (of the mean mse), num_images, and
-        `images`, the metrics of each. lpips is None: its weights are not part of this package.
+    Calls on_view with index, picture and rendering (H, W, 3) of every view. Returns the mean of every metric over the
+    views, psnr_std, psnr_pooled (of the mean mse), num_images, and `images`, the metrics of each. lpips is None: its
+    weights are not part of this package.
     """
     rows = []
     for i, picture in enumerate(pictures):

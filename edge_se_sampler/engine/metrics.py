@@ -29,10 +29,8 @@ def psnr(mse: float) -> float:
 
 
 def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
-    """Mean over pixels and channels of the structural similarity (Wang et al. 2004) of two (H, W, 3) images.
-
-    Windows are Gaussian and lie within the image; None if an image's side is shorter than a window.
-    """
+    """Mean over pixels and channels of the structural similarity (Wang et al. 2004) of two (H, W, 3) images, with
+    Gaussian windows within the image; None if an image's side is shorter than a window."""
     if min(first.shape[:2]) < SSIM_WINDOW:
         return None
     border = SSIM_WINDOW // 2
@@ -58,9 +56,7 @@ def edge_band(image: np.ndarray) -> np.ndarray:
 def compute_metrics(rendered: np.ndarray, image: np.ndarray, background_color: float) -> dict[str, float | None]:
     """All metrics of a rendering (H, W, 3) of an image; None where there is nothing to measure (no alpha, no object).
 
-    Returns:
-        mse (over pixels and channels), psnr, ssim, edge_band_psnr, foreground_psnr (where alpha > 0),
-        background_mse (where alpha = 0).
+    mse is over pixels and channels, foreground_psnr where alpha > 0, background_mse where alpha = 0.
     """
     target = composite_on(image, background_color)
     error = ((rendered.astype(np.float64) - target) ** 2).mean(axis=2)

@@ -17,10 +17,7 @@ LINE = "{desc}: {n_fmt}/{total_fmt}, {percentage:.0f} %, {remaining} left{postfi
 class Progress(AbstractContextManager):
     """Shows on stderr what part of a job is done and how long the rest will take.
 
-    Args:
-        total: steps of the whole job; 0 if only `update` gets to know.
-        start: steps done in an earlier session.
-        clock: seconds, for the lines of a log.
+    `total` is 0 if only `update` gets to know it; `start` steps were done in an earlier session.
     """
 
     def __init__(self, total: int, label: str, start: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
@@ -30,7 +27,6 @@ class Progress(AbstractContextManager):
         self._began = self._last_line = self._last_update = clock()
 
     def update(self, done: int, total: int | None = None, note: str = "") -> None:
-        """Tell that `done` of `total` steps are finished."""
         self.total = self.total if total is None else total
         if not self._bar.disable:
             self._bar.total = self.total
@@ -41,16 +37,8 @@ class Progress(AbstractContextManager):
         next_update, self._last_update = now + (now - self._last_update), now
         if self.total and next_update - self._last_line > SECONDS_PER_LINE:
             self._last_line = now
-            line = tqdm.format_meter(
-                done,
-                self.total,
-                now - self._began,
-                prefix=self.label,
-                postfix=note,
-                initial=self.start,
-                bar_format=LINE,
-            )
-            print(line, file=sys.stderr, flush=True)
+            shown = {"prefix": self.label, "postfix": note, "initial": self.start, "bar_format": LINE}
+            print(tqdm.format_meter(done, self.total, now - self._began, **shown), file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Remove the bar."""

@@ -7,7 +7,7 @@ reinitialized, independently of each other.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -23,24 +23,18 @@ PATIENCE = 8
 PROBE_RAYS = 512
 
 
-def dead_networks(model: RayModel, probes: Iterable[RayBundle]) -> list[str]:
-    """Names of the model's networks that have no density at any sample of the rays.
-
-    Their accumulation is 0: the last interval is endless, so that the smallest density anywhere makes its ray opaque.
-    """
-    probes = list(probes)
+def dead_networks(model: RayModel, probes: Sequence[RayBundle]) -> list[str]:
+    """Names of the model's networks that have no density at any sample of the rays."""
+    # accumulation 0: the last interval is endless, so that the smallest density anywhere makes its ray opaque
     return [
         name for name in model.networks if not any(render_rays(model, r, f"accumulation_{name}").any() for r in probes)
     ]
 
 
 class DeadNetworkReset:
-    """Gives a dead network new initial weights, of the next sub-seed: a function of the run's seed and of how many
-    sub-seeds have been used.
+    """Gives a dead network new initial weights: a function of the run's seed and of how many sub-seeds were used.
 
-    Args:
-        probe: fixed rays, which distinguish a dead network from one whose last batches were empty.
-        seed: the run's.
+    `probe` are fixed rays, which distinguish a dead network from one whose last batches were empty.
     """
 
     def __init__(self, model: RayModel, optimizer: torch.optim.Optimizer, probe: RayBundle, seed: int) -> None:
@@ -70,10 +64,8 @@ class DeadNetworkReset:
         return self.used_sub_seeds
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint."""
         return {"steps_without_gradient": dict(self.steps_without_gradient), "used_sub_seeds": self.used_sub_seeds}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
         self.steps_without_gradient = dict(state["steps_without_gradient"])
         self.used_sub_seeds = state["used_sub_seeds"]

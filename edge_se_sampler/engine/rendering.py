@@ -31,7 +31,6 @@ class Picture:
 
 
 def to_pictures(views: Views) -> list[Picture]:
-    """Every view with its camera."""
     return [Picture(name, unit_float(views.images[i]), views.cameras[[i]]) for i, name in enumerate(views.names)]
 
 

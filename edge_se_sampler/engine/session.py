@@ -123,11 +123,10 @@ def select_views(config: TrainerConfig, count: int) -> list[int] | None:
             raise InputError("--num-views and --views: give one of them")
         check_value("num-views", number, 1 <= number <= count, f"between 1 and {count}, the training views")
         return np.random.RandomState(0).permutation(count)[:number].tolist()
-    if views is None:
-        return None
-    valid = len(views) > 0 and len(set(views)) == len(views) and set(views) <= set(range(count))
-    check_value("views", views, valid, f"at least one of the training views 0 to {count - 1}, each once")
-    return list(views)
+    if views is not None:
+        valid = len(views) > 0 and len(set(views)) == len(views) and set(views) <= set(range(count))
+        check_value("views", views, valid, f"at least one of the training views 0 to {count - 1}, each once")
+    return None if views is None else list(views)
 
 
 def describe_run(trainer: Trainer) -> str:
@@ -153,18 +152,14 @@ def describe_run(trainer: Trainer) -> str:
 
 def choose_device(device_type: str) -> str:
     """The torch device of --machine.device-type; InputError for cuda where torch finds no GPU."""
-    if device_type == "cuda" and not torch.cuda.is_available():
+    has_gpu = torch.cuda.is_available()
+    if device_type == "cuda" and not has_gpu:
         raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
-    if device_type == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return device_type
+    return "cuda" if device_type != "cpu" and has_gpu else "cpu"
 
 
 def disable_malloc_trimming() -> None:
-    """Make glibc's malloc, if there is one, keep large freed blocks instead of returning them to the kernel.
-
-    A training step on a CPU allocates the same megabytes again and again; page faults would take a third of its time.
-    """
+    """Make glibc's malloc, if there is one, keep large freed blocks: page faults slow down training on a CPU."""
     m_trim_threshold, m_top_pad, m_mmap_max = -1, -2, -4
     with contextlib.suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")

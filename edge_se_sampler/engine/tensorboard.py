@@ -14,7 +14,6 @@ class EventWriter:
         self._folder, self._writer = folder, None
 
     def write(self, line: dict[str, Any]) -> None:
-        """Add every number of a metrics line at its step."""
         if find_spec("tensorboard") is None:
             return
         if self._writer is None:
@@ -26,6 +25,5 @@ class EventWriter:
                 self._writer.add_scalar(key, value, line["step"])
 
     def close(self) -> None:
-        """Flush to the disk."""
         if self._writer is not None:
             self._writer.close()

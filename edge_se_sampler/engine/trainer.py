@@ -28,12 +28,7 @@ from edge_se_sampler.sampling.random_streams import Stream, stream
 
 
 class Trainer:
-    """Trains a model into a run folder.
-
-    Args:
-        config: resolved (see `resolve_config`).
-        preview: a held-out view, rendered every now and then; None: no previews.
-    """
+    """Trains a model into a run folder by a resolved config; `preview` is a held-out view, rendered now and then."""
 
     def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
@@ -66,9 +61,7 @@ class Trainer:
 
     def train(self) -> None:
         """Train until the planned iterations are done, max_seconds have passed, or Ctrl-C; then save.
-
-        FloatingPointError if the loss or a weight is not finite: the last checkpoint is kept.
-        """
+        FloatingPointError if the loss or a weight is not finite: the last checkpoint is kept."""
         config = self.config
         began = time.monotonic() - self.elapsed
         deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds

@@ -88,9 +88,7 @@ def framing(size: int, placement: Placement = "centered", offset: tuple[float, f
     rotates the cameras until the world's origin is at the shifted pixel: every loader reads that, but perspective
     stretches the object.
 
-    Raises:
-        InputError: `size` below 8, an unknown placement, or an offset that leaves the object a frame of fewer than 8
-            pixels.
+    InputError for an unknown placement, or if the size or the offset leaves the object fewer than 8 pixels.
     """
     if size < MIN_FRAME:
         raise InputError(f"size is {size} pixels: give at least {MIN_FRAME}")

@@ -27,8 +27,6 @@ _MAX_PROCESSES = 61  # Windows waits for no more
 
 @dataclass(frozen=True)
 class _View:
-    """One picture to render."""
-
     scene: str
     file: str  # inside the scene's folder, no suffix: train/r_0
     camera: Camera
@@ -52,20 +50,19 @@ def make_scenes(
 
     A picture is size x size pixels, RGBA, 8 bits, straight alpha; pixels are the same on every machine, and view i of
     a split does not depend on how many views the split has. Each json also says which of NeRF's scenes it is the
-    `analog_of`. All folders appear together at the end: an error or Ctrl-C leaves nothing behind.
+    `analog_of`. All folders appear together at the end: an error or Ctrl-C leaves nothing behind. More than a few views
+    render in fresh processes: a script that calls this needs the usual `if __name__ == "__main__":` guard.
 
     Args:
-        names: from SCENE_NAMES.
         placement: where the object is seen, see `framing`; for "shifted" the json states `cx` and `cy` (pixels).
         offset: of the object from the middle: right, down, as fractions of `size`.
         seed: 0 to 2**31 - 1; draws the cameras of train and val. Those of test are fixed.
-        progress: called as progress(done, total), in views. More than a few views render in os.cpu_count() fresh
-            processes, so a script that calls this needs the usual `if __name__ == "__main__":` guard.
+        progress: called as progress(done, total), in views.
 
     Raises:
-        InputError: before rendering anything, an unknown or repeated name, a number out of range, an offset that leaves
-            the object fewer than 8 pixels, an `out` that cannot be written, or an out/<name> that is there and not
-            empty; while rendering, an object that reaches the edge of a rotated camera's image.
+        InputError: an unknown or repeated name, a number out of range, an offset that leaves the object fewer than 8
+            pixels, an `out` that cannot be written, an out/<name> that is there and not empty, or an object that
+            reaches the edge of a rotated camera's image.
     """
     counts: dict[Split, int] = {"train": num_train, "val": num_val, "test": num_test}
     _check_arguments(names, counts, seed)
@@ -88,30 +85,26 @@ def _check_arguments(names: Sequence[str], counts: Mapping[Split, int], seed: in
     if len(set(names)) < len(names):
         raise InputError(f"names has a scene twice ({', '.join(names)}): give each once")
     for split, count in counts.items():
-        minimum = 1 if split == "train" else 0
-        if count < minimum:
+        if count < (minimum := int(split == "train")):
             raise InputError(f"num_{split} is {count}: give at least {minimum}")
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}: give a number from 0 to {2**31 - 1}")
 
 
 def _lay_out(workspace: Path, name: str, frame: Framing, cameras: Mapping[Split, Sequence[Camera]]) -> list[_View]:
-    """Writes everything of a scene but the pictures; returns the views to fill in."""
+    """Writes the json files and folders of a scene; returns the views to render."""
     views = []
     for split, split_cameras in cameras.items():
         if not split_cameras:
             continue  # a split without frames is refused when it is read
         (workspace / name / split).mkdir(parents=True)
         files = [f"{split}/r_{index}" for index in range(len(split_cameras))]
-        document = {
-            **frame.intrinsics,
-            "analog_of": ANALOG_OF[name],
-            "generated_by": "edge_se_sampler",
-            "frames": [
-                {"file_path": f"./{file}", "rotation": 0.0, "transform_matrix": camera.to_world.tolist()}
-                for file, camera in zip(files, split_cameras, strict=True)
-            ],
-        }
+        origin = {"analog_of": ANALOG_OF[name], "generated_by": "edge_se_sampler"}
+        frames = [
+            {"file_path": f"./{file}", "rotation": 0.0, "transform_matrix": camera.to_world.tolist()}
+            for file, camera in zip(files, split_cameras, strict=True)
+        ]
+        document = frame.intrinsics | origin | {"frames": frames}
         (workspace / name / f"transforms_{split}.json").write_text(json.dumps(document, indent=4), encoding="utf-8")
         may_clip = frame.placement == "rotated"  # otherwise the ball that holds the scene is in view
         views += [_View(name, file, camera, may_clip) for file, camera in zip(files, split_cameras, strict=True)]
@@ -147,7 +140,6 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _render_png(view: _View) -> bytes:
-    """The PNG file of one view."""
     picture = render(synthetic_scene(view.scene), view.camera)
     border = (picture[0], picture[-1], picture[:, 0], picture[:, -1])
     if view.may_clip and any(pixels[:, 3].any() for pixels in border):

@@ -25,11 +25,7 @@ _SRGB_STEPS = np.round([e / 12.92 if e <= 0.04045 else ((e + 0.055) / 1.055) ** 
 
 
 def render(scene: Scene, camera: Camera) -> NDArray[np.uint8]:
-    """The camera's picture of the scene.
-
-    Returns:
-        (height, width, 4) RGBA, 8 bits, straight alpha, sRGB-encoded; the same bytes on every machine.
-    """
+    """(height, width, 4) RGBA, 8 bits, straight alpha, sRGB-encoded; the same bytes on every machine."""
     depth, seen = first_hits(scene, camera, SAMPLES_PER_AXIS)
     rows, columns = np.nonzero(seen != NOTHING)
     pixels = rows // SAMPLES_PER_AXIS * camera.width + columns // SAMPLES_PER_AXIS
