@@ -122,7 +122,7 @@ def modules_loaded_by(code: str) -> set[str]:
         ("methods", {"tyro"}),
         ("sampling.edges", {"cv2"}),
         ("sampling.distribution", {"torch"}),
-        ("sampling.scoring", {"torch", "cv2"}),  # and all else in sampling
+        ("sampling.pixel_sampler", {"torch", "cv2"}),  # and all else in sampling
     ],
 )
 def test_importing_a_module_loads_only_what_it_needs(module: str, allowed: set[str]) -> None:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.protocol import PixelSampler, TrainingCallbackLocation
-from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling.scoring import build_scorer
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler, build_scorer
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 

@@ -19,8 +19,7 @@ from edge_se_sampler.protocol import (
     TrainingCallbackAttributes,
     TrainingCallbackLocation,
 )
-from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
-from edge_se_sampler.sampling.scoring import build_scorer
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels, build_scorer
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 

@@ -16,8 +16,8 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
 from edge_se_sampler.nerfstudio.resume import planned_steps, restore_schedule, schedule_writer
 from edge_se_sampler.nerfstudio.scoring import get_background_color, observe_training_errors, ray_errors
+from edge_se_sampler.sampling.pixel_sampler import build_scorer
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
-from edge_se_sampler.sampling.scoring import build_scorer
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 

@@ -76,10 +76,8 @@ class SamplerPart:
 
 
 class Distribution(SamplerPart, ABC):
-    """Draws pixels in proportion to their strength, image first, pixel second.
-
-    Tables of an image are built when it is first met, and kept: its pixels and its mask are taken to stay the same.
-    """
+    """Draws pixels in proportion to their strength, image first, pixel second. An image's table is built when it is
+    first met, and kept: its pixels and its mask are taken to stay the same."""
 
     name: ClassVar[str]
 
@@ -166,9 +164,5 @@ class Selector(SamplerPart):
         self.settings = settings
 
     def select(self, candidates: PixelBatch, count: int, step: TrainingStep) -> PixelBatch:
-        """`count` of the candidates.
-
-        Raises:
-            FloatingPointError: a candidate's squared error is not finite.
-        """
+        """`count` of the candidates. Raises FloatingPointError if a squared error is not finite."""
         return candidates

@@ -19,6 +19,8 @@ from edge_se_sampler.sampling.strategies import Uniform, build_strategies
 
 SquaredError = Callable[[dict[str, Any]], Tensor]
 """Candidate batch -> (m,) squared errors of the model's current (fine) colors, without gradients."""
+RayErrors = Callable[[Any, Any, dict[str, Tensor]], Tensor]
+"""Model, ray bundle (n rays), batch -> (n,) squared errors of the model's fine colors on the batch's pixels."""
 
 
 class ImportantPixels:
@@ -83,11 +85,7 @@ class ImportantPixels:
         return self.config.early if self.schedule.phase(self._step.number) == "early" else self.config.late
 
     def check_images(self, image_batch: dict[str, Any]) -> None:
-        """Refuse images that a phase could draw nothing from, before training; its tables are built by that.
-
-        Raises:
-            InputError: as `sample`.
-        """
+        """Before training, refuse images that a phase could draw nothing from: InputError as `sample`."""
         batch = self._read(image_batch)
         for name in {self.config.early, Uniform.name}:
             self.strategies[name].distribution.drawable(batch)
@@ -177,3 +175,28 @@ class ImportantPixels:
 
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
     """Important-pixel sampling on our own protocol's base."""
+
+
+def build_scorer(
+    sampler: ImportantPixels, pipeline: Any, ray_generator: Callable[[Tensor], Any], ray_errors: RayErrors
+) -> SquaredError:
+    """A function that renders a sampler's candidates and returns their squared errors, for `ImportantPixels.bind`.
+
+    Args:
+        sampler: its number of rays, which hosts may change at any time, is how many are rendered at once, so that it
+            takes no more memory than training.
+        pipeline: whose `model` is rendered. It must not be an attribute of a data manager: nerfstudio's is a module,
+            and would count the model's weights as its own.
+        ray_generator: (n, 3) indices -> ray bundle.
+    """
+
+    @torch.no_grad()
+    def squared_error(candidates: dict[str, Tensor]) -> Tensor:
+        errors = []
+        for start in range(0, len(candidates["indices"]), sampler.num_rays_per_batch):
+            rows = slice(start, start + sampler.num_rays_per_batch)
+            batch = {key: candidates[key][rows] for key in ("indices", "image")}
+            errors.append(ray_errors(pipeline.model, ray_generator(batch["indices"]), batch))
+        return torch.cat(errors)
+
+    return squared_error

@@ -11,7 +11,7 @@ R      E[e] / E[b]: 1 for an empty scene, 0 where everything is learnt. Pixels o
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from typing import Any, Literal
 
 from torch import Tensor
@@ -33,7 +33,7 @@ MAX_PIXELS = 256
 """Pixels of a step that are looked at, at most twice as many: enough for the means."""
 
 
-class Schedule(SamplerPart):
+class Schedule(SamplerPart, ABC):
     """Says which phase a step is in."""
 
     early_may_return: bool = False  # after the late phase
