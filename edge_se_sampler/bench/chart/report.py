@@ -12,18 +12,15 @@ from edge_se_sampler.bench.baselines.results import read_baselines
 from edge_se_sampler.bench.chart.figures import draw_chart, draw_scenes
 from edge_se_sampler.bench.chart.summary import (
     END,
-    always_better,
     by_variant,
     comparable,
-    differences,
     mean_psnr_at,
     moments_of,
-    psnr_over_time,
     runs_on,
     scenes_of,
 )
 from edge_se_sampler.bench.chart.trials import ChartSettings
-from edge_se_sampler.bench.chart.variants import COMPARISONS, GROUPS, RECOMMENDED, TOP, VARIANTS
+from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
@@ -59,7 +56,6 @@ def describe(folder: Path) -> str:
         number=len(runs),
         failure_rule=FAILURE_RULE,
         **{group: _describe_group(runs, group, baselines) for group in GROUPS},
-        comparisons=_compare_pairs(runs),
         envelope=_describe_envelope(runs),
         every_scene=_compare_scenes(runs, baselines),
         notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
@@ -113,63 +109,41 @@ def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool 
     return markdown_table([*head, *(("ms a step", "queries a step", "memory") if costs else ())], rows)
 
 
-def _compare_pairs(runs: list[Run]) -> str:
-    """The pairs of variants that tell what one thing is worth, over all scenes that both were trained on."""
-    moments = [seconds for seconds in moments_of(runs) if seconds in COLUMNS]
-    trained, rows = by_variant(runs), []
-    for (first, second), what in COMPARISONS.items():
-        compared = comparable({name: trained.get(name, []) for name in (first, second)})
-        if compared:
-            ahead = [differences(compared[first], compared[second], seconds) for seconds in moments]
-            pair = f"{VARIANTS[first].full_label} − {VARIANTS[second].full_label}"
-            pairs = str(len(compared[first]))
-            rows.append([what, pair, ", ".join(ahead[-1]), pairs, *map(_describe_difference, ahead)])
-    head = ["what", "difference", "scenes", "pairs of trainings", *(COLUMNS[seconds] for seconds in moments)]
-    return markdown_table(head, rows) if rows else ""
-
-
-def _describe_difference(by_scene: Mapping[str, float]) -> str:
-    if not by_scene:
-        return "–"
-    mean = f"{statistics.mean(by_scene.values()):+.2f}"
-    return mean if len(by_scene) == 1 else f"{mean} [{min(by_scene.values()):+.2f}, {max(by_scene.values()):+.2f}]"
-
-
 def _describe_envelope(runs: list[Run]) -> str:
     """Which variant is best when, and by how much."""
-    compared = comparable(by_variant(runs))
+    compared, rows = comparable(by_variant(runs)), []
     if len(compared) < 2:
         return ""
-    label, rows = VARIANTS[RECOMMENDED].label, []
-    for seconds, psnr in psnr_over_time(runs).items():
+    for seconds in moments_of(runs):
+        psnr = {name: value for name, found in compared.items() if (value := mean_psnr_at(found, seconds)) is not None}
         if psnr:
             best = max(psnr, key=psnr.__getitem__)
             gap = psnr[best] - psnr[RECOMMENDED] if RECOMMENDED in psnr else None
             moment = "end" if seconds == END else f"{seconds} s"
             rows.append([moment, VARIANTS[best].full_label, decimals(psnr[best]), decimals(gap)])
-    better = ", ".join(VARIANTS[name].full_label for name in always_better(runs)) or "none"
-    table = markdown_table(["after", "best", "PSNR", f"{label} below it"], rows)
-    return f"On {_list_scenes(compared)}; ahead of {label} at every evaluation: {better}.\n\n{table}"
+    table = markdown_table(["after", "best", "PSNR", f"{VARIANTS[RECOMMENDED].label} below it"], rows)
+    return f"On {_list_scenes(compared)}:\n\n{table}"
 
 
 def _compare_scenes(runs: list[Run], baselines: Baselines) -> str:
-    """PSNR at the end on each scene, of variants and baselines that were trained on all of them."""
+    """PSNR at the end on each scene, of variants and baselines that were trained on more than one."""
     scenes = scenes_of(runs)
     by_label = {VARIANTS[name].full_label: found for name, found in by_variant(runs).items()} | dict(baselines)
-    complete = {label: on_all for label, found in by_label.items() if (on_all := runs_on(found, scenes))}
-    if len(scenes) < 2 or not complete:
-        return ""
+    by_label = {label: found for label, found in by_label.items() if len({*scenes_of(found)}.intersection(scenes)) > 1}
+    on_scenes = [{label: runs_on(found, [scene]) for label, found in by_label.items()} for scene in scenes]
+    compared = [comparable({label: found for label, found in by.items() if found}) for by in on_scenes]
     rows = []
-    for label, found in comparable(complete).items():
-        fields = []
-        for scene in scenes:
-            of_scene = runs_on(found, [scene])
-            psnr = mean_psnr_at(of_scene, END)
-            any_failed = any("outcome" in run and failed(run) for run in of_scene)
-            fields.append(f"({decimals(psnr)})" if any_failed else decimals(psnr))
-        least = min(run["curve"][-1][-1] for run in found)
-        rows.append([label, *fields, decimals(mean_psnr_at(found, END)), f"{least:.2f}", _failures(found)])
-    return markdown_table(["", *scenes, "mean", "least", "failed"], rows)
+    for label in by_label:
+        columns = [by.get(label, []) for by in compared]
+        shown = list(chain(*columns))
+        if shown:
+            fields = [decimals(mean_psnr_at(found, END)) for found in columns]
+            for i, found in enumerate(columns):
+                if any("outcome" in run and failed(run) for run in found):
+                    fields[i] = f"({fields[i]})"
+            mean, least = mean_psnr_at(runs_on(shown, scenes), END), min(run["curve"][-1][-1] for run in shown)
+            rows.append([label, *fields, decimals(mean), decimals(least), _failures(shown)])
+    return markdown_table(["", *scenes, "mean", "least", "failed"], rows) if rows else ""
 
 
 def _failures(runs: list[Run]) -> str:

@@ -70,28 +70,3 @@ def by_variant(runs: list[Run], groups: Collection[str] = GROUPS) -> dict[str, l
     """Variants of some groups that have runs, the recommended one included -> their runs."""
     names = [name for name, variant in VARIANTS.items() if variant.group in groups or name == RECOMMENDED]
     return {name: found for name in names if (found := [run for run in runs if run["variant"] == name])}
-
-
-def psnr_over_time(runs: list[Run]) -> dict[float, dict[str, float]]:
-    """Moment -> variant -> PSNR, of the variants that have been evaluated by then."""
-    compared = comparable(by_variant(runs)).items()
-    return {
-        seconds: {name: psnr for name, found in compared if (psnr := mean_psnr_at(found, seconds)) is not None}
-        for seconds in moments_of(runs)
-    }
-
-
-def always_better(runs: list[Run]) -> list[str]:
-    """Variants ahead of the recommended one at every evaluation that both have."""
-    rows = [psnr for psnr in psnr_over_time(runs).values() if RECOMMENDED in psnr]
-    return [name for name in (rows[-1] if rows else ()) if all(row.get(name, END) > row[RECOMMENDED] for row in rows)]
-
-
-def differences(runs: list[Run], reference: list[Run], seconds: float) -> dict[str, float]:
-    """Scene -> by how many dB some runs are ahead of others at a moment; both are on the same scenes and seeds."""
-    ahead = {}
-    for scene in scenes_of(runs):
-        psnr, reference_psnr = (mean_psnr_at(runs_on(found, [scene]), seconds) for found in (runs, reference))
-        if psnr is not None and reference_psnr is not None:
-            ahead[scene] = psnr - reference_psnr
-    return ahead

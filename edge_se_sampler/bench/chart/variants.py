@@ -86,15 +86,3 @@ VARIANTS: dict[str, Variant] = {
     "rays-512": Variant("size", "512 rays", {f"{MANAGER}.train_num_rays_per_batch": 512}),
 }
 GROUPS = tuple(dict.fromkeys(variant.group for variant in VARIANTS.values()))
-
-COMPARISONS: dict[tuple[str, str], str] = {
-    ("edge-se", "edge"): "squared errors on the original NeRF",
-    ("edge-se-cached", "edge-se"): "caching them",
-    ("lean-se", "lean"): "cached squared errors in lean-nerf",
-    ("lean", "no-hull"): "the hull",
-    ("no-hull", "no-hull-uniform"): "edges first, without a hull",
-    ("lean", "no-density"): "pruning by density, with a hull",
-    ("no-hull", "no-skipping"): "pruning by density, without a hull",
-    ("lean", "frequencies-4"): "6 frequencies instead of 4",
-}
-"""Pairs of variants -> what the first has and the second lacks."""
