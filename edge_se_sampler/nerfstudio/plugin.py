@@ -7,7 +7,6 @@ Must not import nerfstudio.configs.method_configs, which loads this module by it
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -31,18 +30,13 @@ def _nerf(name: str) -> MethodSpecification:
     """One of the paper's strategies on the settings of nerfstudio's vanilla-nerf."""
     early, late, description = STRATEGIES[name]
     sampler = EdgeSEPixelSamplerConfig(early=early, late=late)  # pyright: ignore[reportArgumentType]
-    optimizer = RAdamOptimizerConfig(lr=5e-4, eps=1e-08)
-    config = TrainerConfig(
-        method_name=name,
-        pipeline=VanillaPipelineConfig(
-            datamanager=EdgeSEDataManagerConfig(dataparser=BlenderDataParserConfig(), pixel_sampler=sampler),
-            model=VanillaModelConfig(_target=NeRFModel),
-        ),
-        optimizers={
-            "fields": {"optimizer": optimizer, "scheduler": None},
-            "temporal_distortion": {"optimizer": copy.copy(optimizer), "scheduler": None},
-        },
-    )
+    manager = EdgeSEDataManagerConfig(dataparser=BlenderDataParserConfig(), pixel_sampler=sampler)
+    optimizers = {
+        group: {"optimizer": RAdamOptimizerConfig(lr=5e-4, eps=1e-08), "scheduler": None}
+        for group in ("fields", "temporal_distortion")
+    }
+    pipeline = VanillaPipelineConfig(datamanager=manager, model=VanillaModelConfig(_target=NeRFModel))
+    config = TrainerConfig(method_name=name, pipeline=pipeline, optimizers=optimizers)
     return MethodSpecification(config, description)
 
 
@@ -61,9 +55,7 @@ def _nerfacto() -> MethodSpecification:
         mixed_precision=True,
         pipeline=VanillaPipelineConfig(
             datamanager=EdgeSEDataManagerConfig(
-                dataparser=NerfstudioDataParserConfig(),
-                train_num_rays_per_batch=4096,
-                eval_num_rays_per_batch=4096,
+                dataparser=NerfstudioDataParserConfig(), train_num_rays_per_batch=4096, eval_num_rays_per_batch=4096
             ),
             model=NerfactoModelConfig(
                 eval_num_rays_per_chunk=1 << 15,

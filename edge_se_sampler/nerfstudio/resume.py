@@ -63,8 +63,8 @@ def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
 
 
 def schedule_writer(trainer: Any, schedule: AdaptiveSchedule) -> Callable[..., None]:
-    """A function to be called with each step after training it: writes the schedule's state whenever nerfstudio saves a
-    checkpoint. It raises InputError where it cannot write."""
+    """A function to be called after each step: writes the schedule's state whenever nerfstudio saves a checkpoint, and
+    raises InputError where it cannot."""
     config, start = trainer.config, trainer._start_step
     path, states = trainer.checkpoint_dir.parent / SCHEDULE_FILE, {}
     last = {config.max_num_iterations - 1, start + config.max_num_iterations - 1}  # of nerfstudio's main, of 1.1.5
