@@ -26,15 +26,13 @@ FAILURE_RULE = (
 
 
 def classify(psnr: float, background_psnr: float, foreground_share: float) -> Outcome:
-    """How a training ended: "collapsed", nothing of the object was learnt; "underfit", less than 0.5 dB better than
-    the background alone; else "converged". The first two are failures."""
+    """How a training ended, by FAILURE_RULE: "collapsed" and "underfit" are failures."""
     if foreground_share > COLLAPSED_SHARE:
         return "collapsed"
     return "underfit" if psnr < background_psnr + MIN_GAIN else "converged"
 
 
 def failed(run: dict[str, Any]) -> bool:
-    """Whether a run's outcome is a failure."""
     return run["outcome"] != "converged"
 
 
@@ -52,11 +50,9 @@ def measure_outcome(results: dict[str, Any], pictures: list[Picture], color: flo
         InputError: no view tells the object from the background.
     """
     background = [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
-    gains = [
-        rendered["foreground_psnr"] - empty["foreground_psnr"]
-        for rendered, empty in zip(results["images"], background, strict=True)
-        if rendered["foreground_psnr"] is not None and empty["foreground_psnr"] is not None
-    ]
+    key = "foreground_psnr"
+    views = zip(results["images"], background, strict=True)
+    gains = [rendered[key] - empty[key] for rendered, empty in views if None not in (rendered[key], empty[key])]
     if not gains:
         raise InputError("the held-out views show no object by alpha, which the rule of failure needs")
     background_psnr = sum(view["psnr"] or 0.0 for view in background) / len(background)

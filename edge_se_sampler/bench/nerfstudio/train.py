@@ -21,7 +21,7 @@ from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, r
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import run_in_subprocess
 from edge_se_sampler.bench.scenes import cached_scene
-from edge_se_sampler.bench.timing import time_interleaved
+from edge_se_sampler.bench.timing import median_milliseconds
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
@@ -115,8 +115,8 @@ def _measure_step(method: str, late: str, data: Path, workplace: Path) -> dict[s
             trainer.train_iteration(step)
 
         before = resident_memory()
-        (seconds,) = time_interleaved({"step": train_step}, COST_STEPS, warmup=0).values()
-    return {"seconds": statistics.median(seconds), "bytes": resident_memory("VmHWM") - before}
+        (milliseconds,) = median_milliseconds({"step": train_step}, COST_STEPS, warmup=0).values()
+    return {"seconds": milliseconds / 1000, "bytes": resident_memory("VmHWM") - before}
 
 
 @contextlib.contextmanager

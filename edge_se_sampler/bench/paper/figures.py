@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_ax
 from edge_se_sampler.engine.metrics import composite_on, edge_band
 from edge_se_sampler.sampling.edges import unit_float
 
-COLORS = {"vanilla-nerf": "#1f77b4", "precrop-nerf": "#ff7f0e", "edge-nerf": "#2ca02c"}
-"""The paper's."""
+COLORS = {"vanilla-nerf": "#1f77b4", "precrop-nerf": "#ff7f0e", "edge-nerf": "#2ca02c"}  # the paper's
 FAILED = "#d62728"
 
 Runs = dict[Trial, Run]
@@ -44,10 +44,8 @@ def draw_figures(runs: list[Run], views: Path, folder: Path) -> None:
 
 def _scenes_with_all(runs: Runs, scenes: Iterable[str], tables: Iterable[int], strategies: Iterable[str]) -> list[str]:
     """The scenes of which every table and strategy has a run of the first seed."""
-    seed = min((trial.seed for trial in runs), default=0)
-    return [
-        scene for scene in scenes if all(Trial(table, scene, s, seed) in runs for table in tables for s in strategies)
-    ]
+    seed, keys = min((trial.seed for trial in runs), default=0), list(product(tables, strategies))
+    return [s for s in scenes if all(Trial(table, s, strategy, seed) in runs for table, strategy in keys)]
 
 
 def _runs_of_all_seeds(runs: Runs, table: int, scene: str, strategy: str) -> list[Run]:
@@ -67,12 +65,11 @@ def _show(axis: Any, image: np.ndarray | None, frame: str | None = None, **optio
         axis.imshow(image, interpolation="nearest", **options)
 
 
-def _show_rendering(axis: Any, run: Run | None, path: Path, frame: str | None = None) -> None:
-    """A run's rendering, framed red if it failed; without a run, nothing."""
-    if run is None:
-        _show(axis, None)
-    else:
-        _show(axis, iio.imread(path), FAILED if failed(run) else frame)
+def _show_rendering(axis: Any, runs: Runs, trial: Trial, views: Path, frame: str | None = None) -> None:
+    """A trial's rendering, framed red if it failed; without a run, nothing."""
+    run = runs.get(trial)
+    image = None if run is None else iio.imread(views / f"{trial.name}.png")
+    _show(axis, image, FAILED if run and failed(run) else frame)
 
 
 def _sheet(runs: Runs, views: Path) -> Any:
@@ -94,8 +91,7 @@ def _sheet(runs: Runs, views: Path) -> Any:
             column[0].set_title(scene, fontsize=8, pad=3)
             _show(column[0], composite_on(_read_view(views, number, scene)))
             for axis, strategy in zip(column[1:], LABELS, strict=True):
-                trial = Trial(number, scene, strategy, seed)
-                _show_rendering(axis, runs.get(trial), views / f"{trial.name}.png")
+                _show_rendering(axis, runs, Trial(number, scene, strategy, seed), views)
         for axis, label in zip(axes[:, 0], ("ground truth", *LABELS.values()), strict=True):
             axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
     return figure
@@ -103,12 +99,11 @@ def _sheet(runs: Runs, views: Path) -> Any:
 
 def _figure_2(runs: Runs, views: Path) -> Any:
     """What Precrop's window shows of a centred and of an off-centre object, and what each seed comes to."""
-    scenes = _scenes_with_all(runs, ("mic", "drums"), (1, 2), ("precrop-nerf",))
+    titles = {1: "centred", 16: "as small, centred", 2: "off centre"}
+    scenes = _scenes_with_all(runs, ("mic", "drums"), titles, ("precrop-nerf",))
     if not scenes:
         return None
-    titles = {1: "centred", 16: "as small, centred", 2: "off centre"}
-    tables = [table for table in titles if _scenes_with_all(runs, scenes, (table,), ("precrop-nerf",)) == scenes]
-    columns, seeds = [(s, table) for s in scenes for table in tables], sorted({trial.seed for trial in runs})[:3]
+    columns, seeds = list(product(scenes, titles)), sorted({trial.seed for trial in runs})[:3]
     size = (2.0 * len(columns), 2.3 * (1 + len(seeds)))
     figure, axes = require_pyplot().subplots(1 + len(seeds), len(columns), figsize=size, squeeze=False)
     for column, (scene, table) in zip(axes.T, columns, strict=True):
@@ -119,16 +114,13 @@ def _figure_2(runs: Runs, views: Path) -> Any:
         corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]) - 0.5
         column[0].plot(*corners.T, color=FAILED, lw=1.5)
         column[0].set_title(f"{scene}, {titles[table]}", fontsize=9)
-        if image.shape[2] == 4:
-            column[0].set_xlabel(
-                f"{(image[top:bottom, left:right, 3] > 0).mean():.0%} of the window is object", fontsize=8
-            )
+        object_share = (image[top:bottom, left:right, 3] > 0).mean()
+        column[0].set_xlabel(f"{object_share:.0%} of the window is object", fontsize=8)
         for axis, seed in zip(column[1:], seeds, strict=True):
             trial = Trial(table, scene, "precrop-nerf", seed)
-            _show_rendering(axis, runs.get(trial), views / f"{trial.name}.png", frame="#cccccc")
-            if trial in runs:
-                psnr, background = runs[trial]["psnr"], runs[trial]["background_psnr"]
-                axis.set_xlabel(f"{psnr:.2f} dB (background {background:.2f})", fontsize=8)
+            _show_rendering(axis, runs, trial, views, frame="#cccccc")
+            if run := runs.get(trial):
+                axis.set_xlabel(f"{run['psnr']:.2f} dB (background {run['background_psnr']:.2f})", fontsize=8)
     for axis, label in zip(axes[:, 0], ("a training view", *(f"Precrop, seed {seed}" for seed in seeds)), strict=True):
         axis.set_ylabel(label, fontsize=9)
     figure.tight_layout()
@@ -137,13 +129,12 @@ def _figure_2(runs: Runs, views: Path) -> Any:
 
 def _figure_5(runs: Runs, views: Path) -> Any:
     """Training losses of Random, Precrop and Edge, a line for each seed; a collapsed run stays at its first loss."""
-    tables = [number for number in (1, 2) if any(trial.table == number for trial in runs)]
-    scenes = _scenes_with_all(runs, ("chair", "ficus"), tables, ("vanilla-nerf",))
-    if not tables or not scenes:
+    scenes = _scenes_with_all(runs, ("chair", "ficus"), (1, 2), ("vanilla-nerf",))
+    if not scenes:
         return None
-    size = (4.6 * len(scenes), 2.9 * len(tables))
-    figure, axes = require_pyplot().subplots(len(tables), len(scenes), figsize=size, squeeze=False, sharex=True)
-    for row, table in zip(axes, tables, strict=True):
+    size = (4.6 * len(scenes), 5.8)
+    figure, axes = require_pyplot().subplots(2, len(scenes), figsize=size, squeeze=False, sharex=True)
+    for table, row in enumerate(axes, 1):
         for axis, scene in zip(row, scenes, strict=True):
             for strategy, color in COLORS.items():
                 for i, run in enumerate(_runs_of_all_seeds(runs, table, scene, strategy)):

@@ -23,8 +23,6 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.edges import unit_float
 
-LATE_SE = ("se-nerf", "precrop-se-nerf", "edge-se-nerf")
-
 
 @dataclass(frozen=True)
 class Table:
@@ -43,12 +41,11 @@ class Table:
 # The share of the iterations that costs SE as much time as all of them cost Random. A late step of SE scores twice the
 # rays without gradients: 5 units of work instead of 3; with InfoNeRF's rays of unseen poses, 8 instead of 6.
 EQUAL_TIME = {"nerf": 1 / (0.1 + 0.9 * 5 / 3), "info-nerf": 1 / (0.1 + 0.9 * 8 / 6)}
-RANDOM = ("vanilla-nerf",)
+RANDOM, LATE_SE = ("vanilla-nerf",), ("se-nerf", "precrop-se-nerf", "edge-se-nerf")
 FEW_VIEWS = {"num_views": 10}
 TORCH_WEIGHTS = {f"{MODEL}.initialization": "torch"}
 REINIT_DEAD = {**TORCH_WEIGHTS, "reinit_dead": True}
 SOFTPLUS = {f"{MODEL}.density_activation": "softplus"}
-LAPLACIAN = {f"{SAMPLER}.edge_filter": "laplacian"}
 
 PAPER_TABLES: dict[int, Table] = {
     1: Table("NeRF, all views, centred"),
@@ -66,7 +63,7 @@ TABLES: dict[int, Table] = {
         n + 8: replace(table, title=f"as {n}, in Random's time", strategies=LATE_SE, steps=EQUAL_TIME[table.method])
         for n, table in PAPER_TABLES.items()
     },
-    13: Table("as 1, Laplacian edges", strategies=("edge-nerf",), changes=LAPLACIAN),
+    13: Table("as 1, Laplacian edges", strategies=("edge-nerf",), changes={f"{SAMPLER}.edge_filter": "laplacian"}),
     14: Table("as 1, softplus density", strategies=RANDOM, changes=SOFTPLUS),
     15: Table("as 2, softplus density", "nerf", "shifted", RANDOM, changes=SOFTPLUS),
     16: Table("as 2, as small but centred", "nerf", "padded", ("vanilla-nerf", "precrop-nerf", "edge-nerf")),
@@ -115,7 +112,6 @@ class Trial:
 
 
 def runs_by_trial(runs: list[Run]) -> dict[Trial, Run]:
-    """Trial -> its run."""
     return {Trial(run["table"], run["scene"], run["strategy"], run["seed"]): run for run in runs}
 
 
@@ -177,11 +173,7 @@ def synthetic_scene(table: int, scene: str, settings: Settings, workplace: Path)
 
 
 def real_scene(data: Path, scene: str, placement: str, workplace: Path) -> Path:
-    """A scene of a NeRF-synthetic folder; padded or shifted, it is written to workplace/scenes/offcenter at first.
-
-    Raises:
-        InputError: bad data.
-    """
+    """A scene of a NeRF-synthetic folder; padded or shifted, it is written to workplace/scenes/offcenter at first."""
     if placement == "centered":
         return data / ANALOG_OF[scene]
     counterparts = workplace / "scenes" / "offcenter" / scene

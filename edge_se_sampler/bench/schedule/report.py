@@ -55,14 +55,11 @@ def describe(folder: Path) -> str:
 
 def pair_failures(runs: list[Run]) -> dict[tuple[int, str, int], tuple[bool, bool]]:
     """(table, scene, seed) -> whether Random failed and whether the adaptive schedule did, where both were trained."""
-    random, adaptive = (
-        {
-            (run["table"], run["scene"], run["seed"]): failed(run)
-            for run in runs
-            if (run["part"], run["arm"]) == ("failures", arm)
-        }
-        for arm in ("random", "adaptive")
-    )
+    failures: dict[str, dict[tuple[int, str, int], bool]] = {"random": {}, "adaptive": {}}
+    for run in runs:
+        if run["part"] == "failures":
+            failures[run["arm"]][run["table"], run["scene"], run["seed"]] = failed(run)
+    random, adaptive = failures.values()
     return {key: (random[key], adaptive[key]) for key in sorted(random.keys() & adaptive.keys())}
 
 
@@ -83,7 +80,6 @@ def compare_lengths(runs: list[Run]) -> list[LengthComparison]:
 
 
 def _describe_failures(runs: list[Run]) -> dict[str, Any]:
-    """What report.md says of them; nothing, if no pair was trained."""
     pairs = pair_failures(runs)
     if not pairs:
         return {}
@@ -112,7 +108,6 @@ def _count_failures(pairs: list[tuple[bool, bool]]) -> str:
 
 
 def _describe_lengths(comparisons: list[LengthComparison]) -> dict[str, Any]:
-    """What report.md says of them; nothing, if there are none."""
     if not comparisons:
         return {}
     verdicts = {True: "yes", False: "no", None: "too few runs"}

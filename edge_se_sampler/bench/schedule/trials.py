@@ -20,7 +20,6 @@ from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.train import train_and_measure
 from edge_se_sampler.engine.config import TrainerConfig
 
-Part = Literal["failures", "lengths"]
 SHARES = ("0.02", "0.05", "0.1", "0.2", "0.5")
 CONFIGURATIONS = (1, 2, 5, 6)
 """Tables of `bench paper`: NeRF with all views or ten, centred or off centre."""
@@ -41,7 +40,7 @@ class Settings:
 class Trial:
     """One training."""
 
-    part: Part
+    part: Literal["failures", "lengths"]
     table: int
     scene: str
     iterations: int
