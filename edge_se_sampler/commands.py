@@ -238,7 +238,6 @@ class Bench:
 
 _COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Show, Inspect, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
-"""Name -> command."""
 
 
 def train(trainer: Any) -> None:

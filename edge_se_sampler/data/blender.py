@@ -21,9 +21,6 @@ Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 
 _SUFFIXES = (".png", ".jpg", ".jpeg")
-_RIGID_TOLERANCE = 1e-3  # of the rotation's entries: real files are rounded
-_LAST_ROW_TOLERANCE = 1e-6  # 0 and 1 survive rounding, so this only forgives arithmetic
-_MIN_ANGLE = 1e-6  # radians; below, focal lengths overflow before they mean anything
 
 # of the image and its camera, all in pixels: for one frame, or at the top of the file for all frames
 _INTRINSICS = {
@@ -53,7 +50,6 @@ class _Frame:
 
 
 def transforms_path(folder: Path, split: str) -> Path:
-    """The json file of a split."""
     return folder / f"transforms_{split}.json"
 
 
@@ -145,11 +141,11 @@ def _read_pose(matrix: JsonValue) -> np.ndarray:
         problem = f"must be 4 rows of 4 numbers, not {quote(matrix.value)}"
         raise matrix.location.error(problem, "write the 4x4 camera-to-world matrix")
     pose = np.array([[entry.number() for entry in row.list()] for row in rows])
-    if np.abs(pose[3] - (0, 0, 0, 1)).max() > _LAST_ROW_TOLERANCE:
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
         problem = f"its last row must be [0, 0, 0, 1], not {quote(rows[3].value)}"
         raise matrix.location.error(problem, "put the translation in the last column (transposed?)")
     r = pose[:3, :3].clip(-2, 2)  # no rotation has entries beyond 1, and products of large ones overflow
-    if np.abs(r.T @ r - np.eye(3)).max() > _RIGID_TOLERANCE or np.linalg.det(r) < 0:
+    if np.abs(r.T @ r - np.eye(3)).max() > 1e-3 or np.linalg.det(r) < 0:  # real files are rounded
         hint = "its upper left 3x3 must be orthonormal with determinant +1: remove scale, shear and mirroring"
         raise matrix.location.error("is not a rigid motion", hint)
     return pose[:3]
@@ -163,7 +159,7 @@ def _read_half_tan(top: JsonValue, frames: Sequence[_Frame]) -> float:
             hint = f"add the horizontal field of view in radians, or give {field} its fl_x in pixels"
             raise top.location.member("camera_angle_x").error("is missing", hint)
         return math.nan
-    if not _MIN_ANGLE <= angle.number() < math.pi:
+    if not 1e-6 <= angle.number() < math.pi:  # below, focal lengths overflow
         hint = "write the horizontal field of view in radians (degrees times pi/180)"
         raise angle.location.error(f"must lie between 0 and pi, not {quote(angle.value)}", hint)
     return math.tan(angle.number() / 2)

@@ -72,7 +72,6 @@ class Cameras:
         return Cameras(**{key: value[indices] for key, value in vars(self).items()})
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
-        """The same cameras on a device, in a floating-point type."""
         return Cameras(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in vars(self).items()})
 
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
@@ -124,7 +123,6 @@ class Cameras:
 
 def rotation_power(rotation: Tensor, exponent: float) -> Tensor:
     """The rotation (3, 3) float64 by `exponent` times a rotation's angle (pi: in either sense) about its axis."""
-    rotation = rotation.double()
     axis = torch.linalg.eigh((rotation + rotation.T) / 2).eigenvectors[:, 2]  # of the eigenvalue 1, the largest
     x, y, z = axis.tolist()
     skew = rotation.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -25,9 +25,7 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 
 class VanillaDataManager:
     """Holds the training images, on the CPU as uint8, and asks a pixel sampler which of their pixels to train on.
-
-    `config` has train_num_rays_per_batch resolved; `background_color` (RGB) is for samplers that look at colors.
-    """
+    `config` has train_num_rays_per_batch resolved; `background_color` (RGB) is for samplers that look at colors."""
 
     def __init__(
         self,
@@ -64,7 +62,6 @@ class VanillaDataManager:
         return sampler.state_dict() if isinstance(sampler, (PixelSampler, ImportantPixels)) else {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned."""
         if state:
             self.train_pixel_sampler.load_state_dict(state)
 

@@ -30,7 +30,6 @@ from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
-COPIES = ("centered", "shifted")
 Pair = tuple[int, int]  # x, y
 Fractions = tuple[float, float]  # of an image's width and height
 Files = list[dict[str, str]]  # of each frame: file_path, mask_path -> the file inside a copy
@@ -54,7 +53,6 @@ class Canvas:
 
     @property
     def size(self) -> Pair:
-        """Columns and rows of the canvas."""
         return self.picture[0] + 2 * self.pad[0], self.picture[1] + 2 * self.pad[1]
 
     @property
@@ -130,7 +128,7 @@ def offcenter(
             views = read_blender(data, split)
             canvases = [Canvas.of(image, shift, pad) for image in views.images]
             document = read_json(transforms_path(data, split)).object()
-            for copy in COPIES:
+            for copy in canvases[0].corners:
                 (folder / copy).mkdir(parents=True, exist_ok=True)
                 text = json.dumps(_document(document, files, views, canvases, copy), indent=4)
                 transforms_path(folder / copy, split).write_text(text, encoding="utf-8")
@@ -138,7 +136,7 @@ def offcenter(
             for _ in pool.map(partial(_write_view, folder), files, canvases, views.images, masks):
                 done += 1
                 progress(done, total)
-    return [target / copy for copy in COPIES]
+    return [target / "centered", target / "shifted"]
 
 
 def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Split, Files]:

@@ -30,13 +30,11 @@ class SourceLocation:
     field: str = ""
 
     def member(self, key: str) -> SourceLocation:
-        """Of the member `key` of the object at this location."""
         if not key.isidentifier() or len(key) > 80:
             return SourceLocation(self.file, f"{self.field}[{quote(key)}]")
         return SourceLocation(self.file, f"{self.field}.{key}" if self.field else key)
 
     def item(self, index: int) -> SourceLocation:
-        """Of element `index` of the list at this location."""
         return SourceLocation(self.file, f"{self.field}[{index}]")
 
     def error(self, problem: str, hint: str) -> InputError:
@@ -56,7 +54,6 @@ class SourceFile:
     name: str = ""  # how the field names it; "" if none does
 
     def error(self, problem: str, hint: str) -> InputError:
-        """The error at the location about this file."""
         return self.location.error(f"{quote(self.name)} {problem}" if self.name else problem, hint)
 
     def read_bytes(self) -> bytes:

@@ -89,14 +89,12 @@ class TrainerConfig(InstantiateConfig):
 
     @property
     def preview_interval(self) -> int:
-        """Steps between previews: as given, or a tenth of the iterations."""
-        interval = self.steps_per_eval_image
-        return max(1, self.preset.iterations // 10) if interval is None else interval
+        """Steps between previews."""
+        return max(1, self.preset.iterations // 10) if self.steps_per_eval_image is None else self.steps_per_eval_image
 
     def check(self) -> None:
         """Raise InputError if a value is out of its range or has no effect with the others; the size is decided."""
         manager, model, optimizer = self.pipeline.datamanager, self.pipeline.model, self.optimizer
-        seconds = self.max_seconds
         at_least_one = {
             "max-num-iterations": self.max_num_iterations,
             "steps-per-save": self.steps_per_save,
@@ -106,6 +104,7 @@ class TrainerConfig(InstantiateConfig):
         }
         for flag, value in at_least_one.items():
             check_value(flag, value, value is None or value >= 1, "at least 1")
+        seconds = self.max_seconds
         check_value("max-seconds", seconds, seconds is None or 0 < seconds < INFINITY, "above 0, and finite")
         for name in (self.method_name, self.experiment_name):
             if name in ("", ".", "..") or "/" in str(name) or "\0" in str(name):

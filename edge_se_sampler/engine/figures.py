@@ -22,7 +22,6 @@ def require_pyplot():
 
 
 def style_axes(*axes) -> None:
-    """A light grid, and no frame above and to the right."""
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)

@@ -17,8 +17,7 @@ from edge_se_sampler.occupancy.hull import Hull, find_hit_pixels
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
 from edge_se_sampler.sampling.edges import unit_float
 
-NUM_VIEWS = 3
-"""Views in the picture."""
+NUM_VIEWS = 3  # in the picture
 
 
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:

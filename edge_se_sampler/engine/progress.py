@@ -15,10 +15,8 @@ LINE = "{desc}: {n_fmt}/{total_fmt}, {percentage:.0f} %, {remaining} left{postfi
 
 
 class Progress(AbstractContextManager):
-    """Shows on stderr what part of a job is done and how long the rest will take.
-
-    `total` is 0 if only `update` gets to know it; `start` steps were done in an earlier session.
-    """
+    """Shows on stderr what part of a job is done and how long the rest will take. `total` is 0 if only `update` gets to
+    know it; `start` steps were done in an earlier session."""
 
     def __init__(self, total: int, label: str, start: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         self.total, self.label, self.start, self._clock = total, label, start, clock

@@ -1,8 +1,7 @@
 """New initial weights for dead networks.
 
 With a ReLU, a network whose raw density is negative at every sample has no gradient: no sampler and no number of steps
-can help it. It may be so from its initial weights, or training may bring it there. Coarse and fine network die, and are
-reinitialized, independently of each other.
+can help it. Coarse and fine network die, and are reinitialized, independently of each other.
 """
 
 from __future__ import annotations
@@ -33,9 +32,7 @@ def dead_networks(model: RayModel, probes: Sequence[RayBundle]) -> list[str]:
 
 class DeadNetworkReset:
     """Gives a dead network new initial weights: a function of the run's seed and of how many sub-seeds were used.
-
-    `probe` are fixed rays, which distinguish a dead network from one whose last batches were empty.
-    """
+    `probe` are fixed rays, which distinguish a dead network from one whose last batches were empty."""
 
     def __init__(self, model: RayModel, optimizer: torch.optim.Optimizer, probe: RayBundle, seed: int) -> None:
         self.model, self.optimizer, self.probe, self.seed = model, optimizer, probe, seed

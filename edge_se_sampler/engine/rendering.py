@@ -22,8 +22,7 @@ class Picture:
     name: str
     image: np.ndarray
     """(H, W, 3|4) float32 in [0, 1], straight alpha."""
-    camera: Cameras
-    """One camera."""
+    camera: Cameras  # one
 
     def rays(self, device: torch.device) -> RayBundle:
         """The H * W rays of its pixels, row by row."""

@@ -1,4 +1,5 @@
-"""A run's folder: outputs/<experiment>/<method>/<timestamp>/ with config.json, metrics.jsonl, checkpoints, previews."""
+"""A run's folder: outputs/<experiment>/<method>/<timestamp>/ with config.json, metrics.jsonl, checkpoints, previews,
+and TensorBoard's event files."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +83,28 @@ class RunFolder:
         write_atomically(self.path / "metrics.jsonl", "".join(kept).encode())
 
 
+class EventWriter:
+    """Writes the numbers of metrics.jsonl's lines as TensorBoard's scalars; without the extra it does nothing."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._writer = folder, None
+
+    def write(self, line: dict[str, Any]) -> None:
+        if find_spec("tensorboard") is None:
+            return
+        if self._writer is None:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(self._folder))
+        for key, value in line.items():
+            if key != "step" and isinstance(value, int | float):
+                self._writer.add_scalar(key, value, line["step"])
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
 def _new_folder(parent: Path, name: str) -> Path:
     """Create parent/name, or the first of name-1, name-2, ... that does not exist."""
     paths = (parent / (f"{name}-{attempt}" if attempt else name) for attempt in itertools.count())
@@ -92,7 +116,6 @@ def _new_folder(parent: Path, name: str) -> Path:
 
 
 def config_to_json(config: TrainerConfig) -> dict[str, Any]:
-    """A config as values that json can hold."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=os.fspath))
 
 

@@ -113,10 +113,8 @@ def read_train_views(config: TrainerConfig) -> Views:
 
 
 def select_views(config: TrainerConfig, count: int) -> list[int] | None:
-    """Indices of the views to train on; None: all `count` of them. InputError if the flags do not fit.
-
-    --num-views selects as InfoNeRF's public code does, numpy.random.RandomState(0).permutation(count)[:k].
-    """
+    """Indices of the views to train on; None: all `count` of them. InputError if the flags do not fit. --num-views
+    selects as InfoNeRF's public code does, numpy.random.RandomState(0).permutation(count)[:k]."""
     number, views = config.num_views, config.views
     if number is not None:
         if views is not None:

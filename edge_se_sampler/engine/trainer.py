@@ -21,8 +21,7 @@ from edge_se_sampler.engine.pipeline import Pipeline, load_weights
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
-from edge_se_sampler.engine.run_folder import RunFolder, config_digest
-from edge_se_sampler.engine.tensorboard import EventWriter
+from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
 

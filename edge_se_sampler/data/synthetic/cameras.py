@@ -27,9 +27,6 @@ MIN_FRAME = 8  # pixels; in less an object is a blot
 Placement = Literal["centered", "padded", "shifted", "rotated"]
 Split = Literal["train", "val", "test"]
 
-_SEED_OFFSET = {"train": 0, "val": 2**31}  # apart by more than any seed, so no seed's val is another's train
-_GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -101,10 +98,8 @@ def framing(size: int, placement: Placement = "centered", offset: tuple[float, f
     shift = (round(offset[0] * size), round(offset[1] * size))
     frame = size - 2 * max(abs(shift[0]), abs(shift[1]))
     if frame < MIN_FRAME:
-        raise InputError(
-            f"offset {tuple(offset)} at size {size} leaves the object {max(frame, 0)} pixels: it needs"
-            f" {MIN_FRAME}, so give an offset nearer to zero or a larger size"
-        )
+        problem = f"offset {tuple(offset)} at size {size} leaves the object {max(frame, 0)} pixels"
+        raise InputError(f"{problem}: it needs {MIN_FRAME}, so give an offset nearer to zero or a larger size")
     return Framing(size, placement, shift, 0.5 * frame / math.tan(FIELD_OF_VIEW / 2))
 
 
@@ -115,10 +110,12 @@ def poses(split: Split, count: int, seed: int = 0) -> list[Array]:
     wavy ring at 15 to 45 degrees of elevation, walked in steps of the golden ratio so that any number is spread.
     """
     if split == "test":
-        revolutions = [index / _GOLDEN_RATIO % 1 for index in range(count)]
+        golden_ratio = (1 + math.sqrt(5)) / 2
+        revolutions = [index / golden_ratio % 1 for index in range(count)]
         angles = [(r, math.radians(30 + 15 * math.sin(4 * math.pi * r))) for r in revolutions]
     else:
-        drawn = np.random.RandomState(seed + _SEED_OFFSET[split]).rand(count, 2).tolist()
+        offset = 2**31 if split == "val" else 0  # more than any seed, so no seed's val is another's train
+        drawn = np.random.RandomState(seed + offset).rand(count, 2).tolist()
         # Short of the horizon, and of the pole, where "up" has no direction in the image.
         angles = [(revolution, math.asin(0.02 + 0.96 * height)) for revolution, height in drawn]
     return [_look_at_origin(2 * math.pi * revolution, elevation) for revolution, elevation in angles]

@@ -21,9 +21,6 @@ from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES, che
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
 
-_MIN_VIEWS_PER_PROCESS = 5  # starting a process takes as long as rendering a few
-_MAX_PROCESSES = 61  # Windows waits for no more
-
 
 @dataclass(frozen=True)
 class _View:
@@ -65,19 +62,6 @@ def make_scenes(
             reaches the edge of a rotated camera's image.
     """
     counts: dict[Split, int] = {"train": num_train, "val": num_val, "test": num_test}
-    _check_arguments(names, counts, seed)
-    frame = framing(size, placement, offset)
-    targets = [Path(out) / name for name in names]
-    cameras: dict[Split, list[Camera]] = {
-        split: [frame.camera(pose) for pose in poses(split, count, seed)] for split, count in counts.items()
-    }
-    with staged_folders(Path(out), targets) as workspace:
-        views = [view for name in names for view in _lay_out(workspace, name, frame, cameras)]
-        _render_all(views, workspace, progress)
-    return targets
-
-
-def _check_arguments(names: Sequence[str], counts: Mapping[Split, int], seed: int) -> None:
     if not names:
         raise InputError(f"names is empty: give at least one of {', '.join(SCENE_NAMES)}")
     for name in names:
@@ -89,6 +73,15 @@ def _check_arguments(names: Sequence[str], counts: Mapping[Split, int], seed: in
             raise InputError(f"num_{split} is {count}: give at least {minimum}")
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}: give a number from 0 to {2**31 - 1}")
+    frame = framing(size, placement, offset)
+    targets = [Path(out) / name for name in names]
+    cameras: dict[Split, list[Camera]] = {
+        split: [frame.camera(pose) for pose in poses(split, count, seed)] for split, count in counts.items()
+    }
+    with staged_folders(Path(out), targets) as workspace:
+        views = [view for name in names for view in _lay_out(workspace, name, frame, cameras)]
+        _render_all(views, workspace, progress)
+    return targets
 
 
 def _lay_out(workspace: Path, name: str, frame: Framing, cameras: Mapping[Split, Sequence[Camera]]) -> list[_View]:
@@ -113,7 +106,8 @@ def _lay_out(workspace: Path, name: str, frame: Framing, cameras: Mapping[Split,
 
 def _render_all(views: Sequence[_View], workspace: Path, progress: Callable[[int, int], None]) -> None:
     """Renders every view into its file, in this process if they are few, else in as many as there are CPUs."""
-    processes = min(os.cpu_count() or 1, math.ceil(len(views) / _MIN_VIEWS_PER_PROCESS), _MAX_PROCESSES)
+    # starting a process takes as long as rendering a few views; Windows waits for no more than 61
+    processes = min(os.cpu_count() or 1, math.ceil(len(views) / 5), 61)
     with ExitStack() as stack:
         pictures = map(_render_png, views)
         if processes > 1:

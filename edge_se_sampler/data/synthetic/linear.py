@@ -19,7 +19,6 @@ Index = NDArray[np.int64]
 
 
 def vector(values: ArrayLike) -> Array:
-    """The same numbers as a float64 array."""
     return np.asarray(values, dtype=np.float64)
 
 

@@ -13,8 +13,6 @@ import numpy as np
 from edge_se_sampler.data.synthetic.linear import Array, Index
 from edge_se_sampler.data.synthetic.scene import Pattern
 
-_LATTICE_PRIMES = (374761393, 668265263, 2147483647)
-
 
 def second_color_weight(pattern: int, world: Array, local: Array, frequency: Array) -> Array:
     """Weight (n,), 0 to 1, of the second color at points (3, n), given in the world and in their solids' frames."""
@@ -56,7 +54,6 @@ def value_noise(q: Array) -> Array:
 
 def _lattice_value(i: Index, j: Index, k: Index) -> Array:
     """A fixed random number in 0..1 for each triple of whole numbers (an integer hash)."""
-    a, b, c = _LATTICE_PRIMES
-    h = (i * a + j * b + k * c) & 0xFFFFFFFF
+    h = (i * 374761393 + j * 668265263 + k * 2147483647) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFF) / 65535

@@ -29,8 +29,6 @@ Color = tuple[float, float, float]  # linear RGB, 0 to 1
 
 
 class Pattern(IntEnum):
-    """How a material mixes its two colors over a surface."""
-
     PLAIN = 0
     CHECKER = 1
     STRIPES = 2

@@ -32,10 +32,8 @@ _OFF_SURFACE = 1e-4  # world units by which a secondary ray starts above the sur
 
 
 def radiance(scene: Scene, solid: Index, points: Array, rays: Array, *, bounces: int = 1) -> Array:
-    """Radiance (3, n) toward the eye from points (3, n) on solids (n,), seen along unit rays (3, n).
-
-    With `bounces` 0, as things look in a mirror, shadows and further mirrors are left out.
-    """
+    """Radiance (3, n) toward the eye from points (3, n) on solids (n,), seen along unit rays (3, n). With `bounces` 0,
+    as things look in a mirror, shadows and further mirrors are left out."""
     local, normals, cos_eye = _surface(scene, solid, points, rays)
     material = {name: column[..., scene.material[solid]] for name, column in scene.materials.items()}
     roughness, metalness = material["roughness"], material["metalness"]

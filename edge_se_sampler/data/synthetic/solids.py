@@ -21,18 +21,14 @@ from edge_se_sampler.data.synthetic.linear import Array, Index, dot
 
 
 class Kind(IntEnum):
-    """Which unit solid."""
-
     SPHERE = 0
     BOX = 1
     FRUSTUM = 2
 
 
 def hit_distance(kind: int, taper: Array, origin: Any, direction: Any, beyond: float) -> Array:
-    """Smallest t > `beyond` at which each ray meets the solid's surface, the far side from inside; inf: never.
-
-    `origin` and `direction` are three arrays each (or arrays (3, ...)) that broadcast together; `taper` (2,).
-    """
+    """Smallest t > `beyond` at which each ray meets the solid's surface, the far side from inside; inf: never. `origin`
+    and `direction` are three arrays each (or arrays (3, ...)) that broadcast together; `taper` (2,)."""
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel rays give inf or nan, which every test rejects
         if kind == Kind.SPHERE:
             return _hit_sphere(origin, direction, beyond)

@@ -26,10 +26,8 @@ _SELF = 1e-5  # a ray that starts on a surface does not meet it again within thi
 
 
 def first_hits(scene: Scene, camera: Camera, per_axis: int) -> tuple[Array, Index]:
-    """What the camera sees through per_axis x per_axis samples of each pixel.
-
-    Returns t (rows, columns) along rays of unit depth and the solid's index, NOTHING where there is none.
-    """
+    """What the camera sees through per_axis x per_axis samples of each pixel. Returns t (rows, columns) along rays of
+    unit depth and the solid's index, NOTHING where there is none."""
     x_slopes, y_slopes = camera.sample_slopes(per_axis)
     rotation, eye = camera.to_world[:3, :3], camera.to_world[:3, 3]
     local_eye = apply(scene.to_local[:, :3], eye) + scene.to_local[:, 3]
