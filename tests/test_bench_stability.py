@@ -39,12 +39,9 @@ CPU = torch.device("cpu")
 def small_images(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(scenes, "SIZE", 24)
     monkeypatch.setattr(scenes, "SHIFT", (5, 3))
-    caches = (scenes.render_splits, scenes._find_focal)
-    for cache in caches:
-        cache.cache_clear()
+    scenes.render_splits.cache_clear()
     yield
-    for cache in caches:
-        cache.cache_clear()
+    scenes.render_splits.cache_clear()
 
 
 # -- settings

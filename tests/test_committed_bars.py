@@ -15,6 +15,7 @@ from edge_se_sampler.bench.chart.summary import mean_psnr_at
 from edge_se_sampler.bench.chart.variants import VARIANTS
 from edge_se_sampler.bench.demo import train as demo
 from edge_se_sampler.bench.paper.published import SCENES
+from edge_se_sampler.bench.scenes import cached_scene
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -65,7 +66,8 @@ def test_every_variant_of_the_chart_was_trained_with_three_seeds():
 @pytest.mark.parametrize("method", demo.METHODS)
 def test_the_demo_comes_out_again(method: str, tmp_path: Path):
     """Its first 40 steps, on whatever machine this is: rounding grows with the steps, so the bound is loose."""
-    trainer = demo.build_trainer(method, demo.render_scene(tmp_path), tmp_path / "runs", seed=0)
+    scene = cached_scene(tmp_path, **demo.SCENE, **demo.SPLITS)
+    trainer = demo.build_trainer(method, scene, tmp_path / "runs", seed=0)
     losses = [trainer.train_iteration(step) for step in range(41)]
     for line in result("demo/seed-0/demo.json")["methods"][method]["loss"][:5]:
         assert math.isclose(losses[line["step"]], line["loss"], rel_tol=0.02), line

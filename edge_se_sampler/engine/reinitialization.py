@@ -13,7 +13,7 @@ import torch
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.rendering import render_rays
-from edge_se_sampler.models.field import NeRFField
+from edge_se_sampler.models.field import NeRFField, initialize_linear
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
@@ -55,7 +55,8 @@ class DeadNetworkReset:
 
     def _reinitialize(self, field: NeRFField) -> int:
         self.used_sub_seeds += 1
-        field.initialize(self.model.config.initialization, stream(self.seed, self.used_sub_seeds, Stream.WEIGHTS))
+        rng = stream(self.seed, self.used_sub_seeds, Stream.WEIGHTS)
+        initialize_linear(field, self.model.config.initialization, rng)
         for weight in field.parameters():
             self.optimizer.state.pop(weight, None)
         return self.used_sub_seeds

@@ -34,11 +34,7 @@ class NeRFField(nn.Module):
         self.feature = linear(width, width)
         self.view = linear(width + encoded_size(3, self.direction_frequencies), width // 2)
         self.color = linear(width // 2, 3)
-        self.initialize(config.initialization, rng)
-
-    def initialize(self, scheme: str, rng: np.random.Generator) -> None:
-        """Give every layer new initial weights, see `initialize_linear`."""
-        initialize_linear(self, scheme, rng)
+        initialize_linear(self, config.initialization, rng)
 
     def forward(self, positions: Tensor, directions: Tensor, ray_indices: Tensor | None, noise: Tensor | None = None):
         """Evaluate points.
@@ -60,20 +56,16 @@ class NeRFField(nn.Module):
         raw = self.density(h)[:, 0]
         raw = raw if noise is None else raw + noise
         density = F.softplus(raw - 1) if self.softplus else F.relu(raw)
-        return density, torch.sigmoid(self.color(self._view(self.feature(h), directions, ray_indices)))
 
-    def _view(self, feature: Tensor, directions: Tensor, ray_indices: Tensor | None) -> Tensor:
-        """The direction's layer on (feature, encoded direction), its second half computed once a ray."""
-        width = feature.shape[1]
-        per_ray = F.linear(
-            positional_encoding(directions, self.direction_frequencies), self.view.weight[:, width:], self.view.bias
-        )
-        h = F.linear(feature, self.view.weight[:, :width])
+        # the layer of the direction, on (feature, encoded direction): its second half is computed once a ray
+        width, encoded = h.shape[1], positional_encoding(directions, self.direction_frequencies)
+        per_ray = F.linear(encoded, self.view.weight[:, width:], self.view.bias)
+        h = F.linear(self.feature(h), self.view.weight[:, :width])
         if ray_indices is None:
             h = (h.reshape(len(directions), -1, h.shape[1]) + per_ray[:, None]).reshape(h.shape)
         else:
             h = h + per_ray[ray_indices]
-        return F.relu(h, inplace=True)
+        return density, torch.sigmoid(self.color(F.relu(h, inplace=True)))
 
 
 def encoded_size(dimensions: int, frequencies: int) -> int:

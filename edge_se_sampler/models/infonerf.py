@@ -19,7 +19,6 @@ from torch import Tensor
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import InfoNeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
-from edge_se_sampler.models.rendering import opacity
 
 TINY = 1e-10
 
@@ -95,4 +94,4 @@ class InfoNeRFModel(NeRFModel):
 
 
 def _alpha(outputs: dict[str, Tensor]) -> Tensor:
-    return opacity(outputs["density_fine"], outputs["delta_fine"])
+    return -torch.expm1(-outputs["density_fine"] * outputs["delta_fine"])

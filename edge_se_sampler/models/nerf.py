@@ -74,8 +74,8 @@ class NeRFModel(RayModel):
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
         noise = None
         if self.training and self.config.density_noise:
-            noise = torch.randn(t.numel(), generator=self.random, device=self.device, dtype=self.dtype)
-            noise = noise * self.config.density_noise
+            draws = torch.randn(t.numel(), generator=self.random, device=self.device, dtype=self.dtype)
+            noise = draws * self.config.density_noise
         if self.grid is None:
             density, color = field(positions, rays.directions, None, noise)
         else:

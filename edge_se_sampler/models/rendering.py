@@ -14,14 +14,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-FAR_AWAY = 1e10
-"""Length of the last interval."""
-
 
 def intervals(t: Tensor, *, endless: bool = True) -> Tensor:
     """delta: (n, s) -> (n, s); the last reaches to infinity, or is as long as the one before it."""
     delta = t[:, 1:] - t[:, :-1]
-    return torch.cat((delta, torch.full_like(t[:, :1], FAR_AWAY) if endless else delta[:, -1:]), dim=1)
+    return torch.cat((delta, torch.full_like(t[:, :1], 1e10) if endless else delta[:, -1:]), dim=1)
 
 
 def sample_weights(sigma: Tensor, delta: Tensor) -> Tensor:
@@ -30,11 +27,6 @@ def sample_weights(sigma: Tensor, delta: Tensor) -> Tensor:
     before = torch.cumsum(depth[:, :-1], dim=1)
     transmittance = torch.exp(-torch.nn.functional.pad(before, (1, 0)))
     return transmittance * -torch.expm1(-depth)
-
-
-def opacity(sigma: Tensor, delta: Tensor) -> Tensor:
-    """alpha of every interval, (n, s) in [0, 1]."""
-    return -torch.expm1(-sigma * delta)
 
 
 def composite(weights: Tensor, colors: Tensor, background: Tensor) -> Tensor:

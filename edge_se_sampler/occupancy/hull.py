@@ -57,18 +57,12 @@ class Silhouette:
     uncropped: bool
     """Whether it keeps clear of the image's border, which therefore shows all of the object."""
 
-    @classmethod
-    def from_mask(cls, mask: np.ndarray) -> Silhouette:
-        """The silhouette of a foreground mask (H, W) bool."""
-        height, width = mask.shape
-        inner = mask[MARGIN : height - MARGIN, MARGIN : width - MARGIN]
-        return cls(cv2.integral(mask.astype(np.uint8)), np.count_nonzero(inner) == np.count_nonzero(mask))
-
     def overlaps(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """(m,) bool: whether rectangles, least and greatest u, v (2, m), widened by MARGIN have any foreground."""
         height, width = self.integral_image.shape
-        left, right = (_clip(bound, width) for bound in (np.floor(low[0]) - MARGIN, np.ceil(high[0]) + MARGIN))
-        top, bottom = (_clip(bound, height) * width for bound in (np.floor(low[1]) - MARGIN, np.ceil(high[1]) + MARGIN))
+        low, high = np.floor(low) - MARGIN, np.ceil(high) + MARGIN
+        left, right = (u.clip(0, width - 1).astype(np.int64) for u in (low[0], high[0]))
+        top, bottom = (v.clip(0, height - 1).astype(np.int64) * width for v in (low[1], high[1]))
         count = self.integral_image.reshape(-1)
         return count[bottom + right] - count[top + right] > count[bottom + left] - count[top + left]
 
@@ -109,12 +103,11 @@ def find_silhouettes(views: Views) -> dict[int, Silhouette]:
     for i, image in enumerate(views.images):
         foreground = image[..., 3] > 0 if image.shape[2] == 4 else np.ones(image.shape[:2], dtype=bool)
         if foreground.any() and not foreground.all():
-            found[i] = Silhouette.from_mask(foreground if views.masks is None else foreground | ~views.masks[i])
+            mask = foreground if views.masks is None else foreground | ~views.masks[i]
+            height, width = image.shape[:2]
+            uncropped = bool(mask[MARGIN : height - MARGIN, MARGIN : width - MARGIN].sum() == mask.sum())
+            found[i] = Silhouette(cv2.integral(mask.astype(np.uint8)), uncropped)
     return found
-
-
-def _clip(values: np.ndarray, size: int) -> np.ndarray:
-    return values.clip(0, size - 1).astype(np.int64)
 
 
 def carve(views: Views, silhouettes: dict[int, Silhouette], box: Box, cell_size: float) -> Hull | None:
@@ -148,10 +141,8 @@ def _may_hold_something(
 ) -> np.ndarray:
     """(m,) bool: cells that some view sees and that fewer than MIN_EMPTY_VIEWS show to be empty."""
     min_empty_views = min(MIN_EMPTY_VIEWS, max(1, len(silhouettes)))
-    result = np.zeros(len(centers), dtype=bool)
     candidates = np.arange(len(centers))  # all that are not known to be empty, and maybe some that are
-    empty_views = np.zeros(len(centers), dtype=np.int32)
-    seen = np.zeros(len(centers), dtype=bool)
+    empty_views, seen = np.zeros(len(centers), dtype=np.int32), np.zeros(len(centers), dtype=bool)
     for i, image in enumerate(views.images):
         low, high, side = project_cells(views.cameras, i, centers[candidates], cell_size)
         height, width = image.shape[:2]
@@ -163,6 +154,7 @@ def _may_hold_something(
             undecided = empty_views < min_empty_views
             if np.count_nonzero(undecided) < MIN_CANDIDATES * len(undecided):
                 candidates, seen, empty_views = candidates[undecided], seen[undecided], empty_views[undecided]
+    result = np.zeros(len(centers), dtype=bool)
     result[candidates] = seen & (empty_views < min_empty_views)
     return result
 
@@ -196,16 +188,13 @@ def _in_image(low: np.ndarray, high: np.ndarray, width: int, height: int) -> np.
 
 def find_hit_pixels(views: Views, hull: Hull) -> list[np.ndarray]:
     """(H, W) bool of each view: all pixels whose rays hit the hull, and few others."""
-    centers = hull.aabb_min + (np.argwhere(_outermost(hull.cells)) + 0.5) * hull.cell_size
-    return [_covered_pixels(views, i, centers, hull.cell_size) for i in range(len(views.images))]
-
-
-def _outermost(cells: np.ndarray) -> np.ndarray:
-    """(X, Y, Z) bool: cells with one of the 26 around them empty; a ray from outside hits one of these first."""
-    inner = np.pad(cells, 1)
+    inner = np.pad(hull.cells, 1)
     for axis in range(3):
         inner = inner & np.roll(inner, 1, axis) & np.roll(inner, -1, axis)
-    return cells & ~inner[1:-1, 1:-1, 1:-1]
+    # a ray from outside first hits a cell that has one of the 26 around it empty
+    outermost = np.argwhere(hull.cells & ~inner[1:-1, 1:-1, 1:-1])
+    centers = hull.aabb_min + (outermost + 0.5) * hull.cell_size
+    return [_covered_pixels(views, i, centers, hull.cell_size) for i in range(len(views.images))]
 
 
 def _covered_pixels(views: Views, index: int, centers: np.ndarray, cell_size: float) -> np.ndarray:

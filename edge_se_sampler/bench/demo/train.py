@@ -25,7 +25,6 @@ SCENE: dict[str, Any] = {"name": "mic", "placement": "shifted", "offset": (0.2, 
 SPLITS: dict[str, Any] = {"num_train": 50, "num_val": 1, "num_test": 10}
 ITERATIONS = 600
 METHODS = {"vanilla-nerf": "Random", "edge-se-nerf": "Edge + SE"}
-COLORS = {"vanilla-nerf": "#7f7f7f", "edge-se-nerf": "#d62728"}
 
 
 def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
@@ -40,7 +39,7 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     require_pyplot()
     make_folder(output_dir, "--output-dir")
     start = time.monotonic()
-    scene = render_scene(output_dir / "demo")
+    scene = cached_scene(output_dir / "demo", **SCENE, **SPLITS)
     methods, views = {}, {}
     for method in METHODS:
         methods[method], views[method] = _train(method, scene, output_dir / "demo" / "runs", seed)
@@ -56,16 +55,11 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     return result
 
 
-def render_scene(workplace: Path) -> Path:
-    """The demo's Blender folder, kept in the workplace."""
-    return cached_scene(workplace, **SCENE, **SPLITS)
-
-
-def build_trainer(method: str, scene: Path, output_dir: Path, seed: int) -> Trainer:
-    """What trains one of the demo's methods, its run in output_dir."""
+def build_trainer(method: str, scene: Path, runs: Path, seed: int) -> Trainer:
+    """What trains one of the demo's methods, its run below a folder."""
     changes = {
         "data": scene,
-        "output_dir": output_dir,
+        "output_dir": runs,
         "max_num_iterations": ITERATIONS,
         "steps_per_eval_image": ITERATIONS // 20,
         "machine.seed": seed,
@@ -107,7 +101,7 @@ def _draw(
         axes[name].imshow(views.get(name, target), interpolation="nearest")
         axes[name].set(title=title, xticks=[], yticks=[])
     for x, label in (("step", "iterations"), ("seconds", "seconds of training")):
-        for method, color in COLORS.items():
+        for method, color in zip(METHODS, ("#7f7f7f", "#d62728"), strict=True):
             lines = methods[method]["validation"]
             curve = [line["val_psnr"] for line in lines]
             axes[x].plot([line[x] for line in lines], curve, color=color, label=METHODS[method])

@@ -6,12 +6,11 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.nerfstudio.train import METHODS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import fill_template
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.tables import describe_command, markdown_table
-
-LABELS = {"vanilla-nerf": "`vanilla-nerf`: nerfstudio's uniform pixels", "edge-se-nerf": "`edge-se-nerf`: Edge + SE"}
 
 
 def describe(folder: Path) -> str:
@@ -29,13 +28,13 @@ def describe(folder: Path) -> str:
 
 def _tabulate_failures(runs: list[Run]) -> str:
     rows = []
-    for method, label in LABELS.items():
+    for method, label in METHODS.items():
         of_method = [run for run in runs if run["method"] == method]
         if of_method:
             collapsed = sum(run["outcome"] == "collapsed" for run in of_method)
             failures = f"{sum(map(failed, of_method))} of {len(of_method)}"
             psnr = statistics.mean(run["psnr"] for run in of_method)
-            rows.append((label, failures, str(collapsed), f"{psnr:.2f} dB"))
+            rows.append((f"`{method}`: {label}", failures, str(collapsed), f"{psnr:.2f} dB"))
     return markdown_table(("", "failed", "of them collapsed", "mean PSNR"), rows)
 
 

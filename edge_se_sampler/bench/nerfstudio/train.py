@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,11 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
 
-METHODS = ("vanilla-nerf", "edge-se-nerf")
+METHODS = {"vanilla-nerf": "nerfstudio's uniform pixels", "edge-se-nerf": "Edge + SE"}
 SCENE_OPTIONS = {
     "size": 64, "num_train": 30, "num_val": 1, "num_test": 3, "placement": "shifted", "offset": (0.2, 0.15),
 }  # fmt: skip
 RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
-COST_METHODS = ("edge-se-nerf", "edge-se-nerfacto")
 COST_RAYS, COST_STEPS, COST_ROUNDS = 256, 8, 3
 
 
@@ -93,12 +93,10 @@ def measure_costs(data: Path, workplace: Path) -> dict[str, Any]:
         after set-up, in fresh processes that take turns.
     """
     costs: dict[str, list[dict[str, float]]] = defaultdict(list)
-    for _, method, late in product(range(COST_ROUNDS), COST_METHODS, ("uniform", "se")):
+    for _, method, late in product(range(COST_ROUNDS), ("edge-se-nerf", "edge-se-nerfacto"), ("uniform", "se")):
         costs[f"{method} {late}"].append(run_in_subprocess(_measure_step, method, late, data, workplace))
-    medians = {
-        case: {key: statistics.median(cost[key] for cost in repeated) for key in ("seconds", "bytes")}
-        for case, repeated in costs.items()
-    }
+    keys = ("seconds", "bytes")
+    medians = {case: {key: statistics.median(map(itemgetter(key), costs[case])) for key in keys} for case in costs}
     return {"rays": COST_RAYS, "medians": medians}
 
 

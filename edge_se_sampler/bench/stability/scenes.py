@@ -37,7 +37,6 @@ def render_splits(foreground: float, shifted: bool, num_train: int) -> tuple[Vie
     return _render("train", focal, shifted, num_train), _render("test", focal, shifted, NUM_TEST)
 
 
-@lru_cache(maxsize=16)
 def _find_focal(foreground: float, num_train: int) -> float:
     """Focal length in pixels at which the object covers that share; the share grows with its square, nearly."""
     focal = float(SIZE)

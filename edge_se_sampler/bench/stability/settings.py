@@ -72,10 +72,9 @@ PAIRS: tuple[dict[str, Any], ...] = (
 """Small and off centre; off centre and few views; what PyTorch ports start with, and softplus, which may help them."""
 
 
-_CHANGES = [{}, *({axis: value} for axis, (_, values) in AXES.items() for value in values), *PAIRS]
 SETTINGS = {
     ", ".join(AXES[axis][0].format(value) for axis, value in changes.items()) or "base": Setting(**changes)
-    for changes in _CHANGES
+    for changes in ({}, *({axis: value} for axis, (_, values) in AXES.items() for value in values), *PAIRS)
 }
 """Label, which says what differs from the base setting -> setting."""
 

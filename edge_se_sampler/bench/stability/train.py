@@ -8,7 +8,7 @@ import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -27,12 +27,8 @@ from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
 
-FailureMode = Literal["underfit", "dead at the start", "emptied", "opaque background"]
-LEARNING_RATE = 3e-3
 NUM_EVALUATIONS = 10
 """Of a training, on its way."""
-MODEL_FIELDS = ("depth", "density_activation", "initialization", "density_noise")
-"""Fields of a `Setting` that are the model's."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +59,10 @@ class Rendered:
         """By the rule of all experiments."""
         return classify(self.psnr, self.background_psnr, self.share)
 
-    def failure_mode(self, dead_at_start: bool) -> FailureMode | None:
+    def failure_mode(self, dead_at_start: bool) -> str | None:
         """How the network failed, if it did; dead_at_start: it had no density anywhere before the first step."""
         if self.outcome != "collapsed":
-            return "underfit" if self.outcome == "underfit" else None
+            return None if self.outcome == "converged" else self.outcome
         if dead_at_start:
             return "dead at the start"
         return "opaque background" if self.accumulation > 0.5 else "emptied"
@@ -93,16 +89,11 @@ def run_trial(trial: Trial, size: TrainingSize) -> dict[str, Any]:
                 shares.append(round(render_networks(model, pictures, stride=5)["fine"].share, 4))
         resets = trainer.dead_network_reset
     rendered = render_networks(model, pictures)
-    modes = {network: result.failure_mode(network in dead) for network, result in rendered.items()}
-    run: dict[str, Any] = {
-        "outcome": rendered["fine"].outcome,
-        "failure_mode": modes["fine"],
-        "coarse_failure_mode": modes["coarse"],
-    }
-    for network, result in rendered.items():
-        run |= {f"{network}_{key}": round(value, 4) for key, value in asdict(result).items()}
     return {
-        **run,
+        "outcome": rendered["fine"].outcome,
+        "failure_mode": rendered["fine"].failure_mode("fine" in dead),
+        "coarse_failure_mode": rendered["coarse"].failure_mode("coarse" in dead),
+        **{f"{name}_{key}": round(value, 4) for name in rendered for key, value in asdict(rendered[name]).items()},
         "dead_at_start": dead,
         "reinitialized": 0 if resets is None else resets.used_sub_seeds,
         "shares": shares,
@@ -122,14 +113,17 @@ def build_trainer(
         "max_num_iterations": size.iterations,
         "machine.seed": seed,
         "machine.device_type": "cpu",
-        "optimizer.lr": LEARNING_RATE * setting.lr_scale,
+        "optimizer.lr": 3e-3 * setting.lr_scale,
         f"{MANAGER}.train_num_rays_per_batch": size.rays,
         f"{MODEL}.size": "tiny",
         f"{MODEL}.width": size.width,
         f"{MODEL}.num_coarse_samples": size.samples,
         f"{MODEL}.num_importance_samples": size.samples,
         f"{MODEL}.background_color": "random" if setting.background == "random" else "white",
-        **{f"{MODEL}.{name}": getattr(setting, name) for name in MODEL_FIELDS},
+        f"{MODEL}.depth": setting.depth,
+        f"{MODEL}.density_activation": setting.density_activation,
+        f"{MODEL}.initialization": setting.initialization,
+        f"{MODEL}.density_noise": setting.density_noise,
         **STRATEGIES[strategy].changes,
     }
     config = resolve_config(override(method_configs()[STRATEGIES[strategy].method], changes), train)
