@@ -29,10 +29,6 @@ from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid, di
 DENSITY_BIAS = -1.0
 """Raw density at first: thin enough to see through the object, dense enough to have a gradient. In an uncarved box it
 would be an opaque fog: there, the box has an optical depth of 1 across."""
-UNCARVED_FRACTION = 0.9
-"""Share of a box's cells in the hull above which the box counts as uncarved: the object may be anywhere."""
-MAX_LOG_DENSITY = 8.0
-"""Raw density above which a cell is opaque anyway."""
 UPDATE_INTERVAL = 128
 """Steps between prunings: long enough for the cells to be seen. Half as many as long as the cells may be subdivided."""
 ALPHA_THRESHOLD = 0.01
@@ -40,10 +36,6 @@ ALPHA_THRESHOLD = 0.01
 MIN_OPTICAL_DEPTH = 0.5
 """Optical depth above which a cell counts as surface; while no cell of a grid that may be subdivided has it, pruning is
 suspended."""
-REACTIVATION_FRACTION = 0.02
-"""Share of the empty cells that are reactivated at each pruning; halved per level, which has eight times the cells."""
-MISSED_FRACTION = 0.01
-"""Share of the surface's cells that are not refined from which on they, too, are refined."""
 
 
 class LeanField(nn.Module):
@@ -93,7 +85,7 @@ class LeanModel(RayModel):
         super().__init__(config, grid)
         self.fine = LeanField(config, rng)
         box = grid.static_mask_at(0)[1:-1, 1:-1, 1:-1]  # without the rim
-        if box.float().mean() > UNCARVED_FRACTION:
+        if box.float().mean() > 0.9:  # uncarved: the object may be anywhere
             with torch.no_grad():
                 self.fine.density.bias.sub_(math.log(max(box.shape)) + DENSITY_BIAS)
         self.features = FeatureGrid(grid, config.feature_dim) if config.feature_dim else None
@@ -122,7 +114,7 @@ class LeanModel(RayModel):
         if step == interval or (subdivisible and not surface.any()):  # the first densities mean nothing
             grid.max_density.zero_()
             return
-        fraction = REACTIVATION_FRACTION / 2 ** int(grid.level)
+        fraction = 0.02 / 2 ** int(grid.level)  # of the empty cells; a level has eight times those of the one before
         reactivated = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < fraction
         min_density = -math.log1p(-ALPHA_THRESHOLD) / float(grid.initial_cell_size / 2**grid.max_level)
         dense = grid.prune(min_density, reactivated)
@@ -130,14 +122,15 @@ class LeanModel(RayModel):
 
     def _refine(self, dense: Tensor, surface: Tensor) -> None:
         """Subdivide the grid, at level 0 always, later when its cells are few enough; else refine surface cells that
-        pruning had missed. Both (X, Y, Z) bool: cells that pruning has kept, and those that count as surface."""
+        pruning had missed, if they are above 1 % of all. Both (X, Y, Z) bool: cells that pruning has kept, and those
+        that count as surface."""
         grid, features, level = self.grid, self.features, int(self.grid.level)
         if level < grid.max_level and (level == 0 or 8 * dense.sum() <= MAX_OCCUPIED_CELLS):
             grid.subdivide() if features is None else features.refine(upsample(dense) & grid.static_mask_at(level + 1))
         elif features is not None and level:
             missed = surface & ~grid.refined
             refined = grid.refined | (dilate(missed) & grid.static_mask)
-            if missed.sum() > MISSED_FRACTION * surface.sum() and refined.sum() <= MAX_OCCUPIED_CELLS:
+            if missed.sum() > 0.01 * surface.sum() and refined.sum() <= MAX_OCCUPIED_CELLS:
                 features.refine(refined)
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
@@ -150,7 +143,7 @@ class LeanModel(RayModel):
         features = positions[:, :0] if self.features is None else self.features(positions, samples.cell_indices)
         centered = (positions - grid.center) / grid.half_extent
         raw, color = self.fine(centered, features, rays.directions, samples.ray_starts, samples.ray_indices)
-        density = torch.exp(raw.clamp(max=MAX_LOG_DENSITY)) / float(grid.initial_cell_size)
+        density = torch.exp(raw.clamp(max=8)) / float(grid.initial_cell_size)  # more is as opaque
         if self.training and self.config.prunes_cells:
             grid.update_max_density(samples, density)
         rgb, accumulation = render_packed(density, color, step, samples.ray_starts, samples.ray_indices)

@@ -43,10 +43,9 @@ class SceneAnalysis:
 def analyze_scene(
     views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool, prunable: bool
 ) -> SceneAnalysis:
-    """Derive the cells of a scene from its training views.
+    """Derive the cells of a scene from its training views, whose rays are sampled between depths near and far.
 
     Args:
-        near, far: depths between which rays are sampled, world units.
         voxel_size_px: size of a cell, in footprints of a pixel.
         by_alpha: whether the visual hull is carved from alpha.
         prunable: whether training prunes cells. It then begins with larger ones, to subdivide those that stay: twice as

@@ -14,11 +14,7 @@ from edge_se_sampler.bench.tables import describe_command, markdown_table
 
 
 def describe(folder: Path) -> str:
-    """README.md of the trainings in a folder, and of the costs of steps once they are measured.
-
-    Raises:
-        InputError: the result cannot be read.
-    """
+    """README.md of the trainings in a folder, and of the costs of steps once they are measured."""
     result = read_result(folder / "result.json")
     parts = {"failures": _tabulate_failures(result["runs"]), "failure_rule": FAILURE_RULE}
     if "costs" in result:

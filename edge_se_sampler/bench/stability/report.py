@@ -26,11 +26,7 @@ Modes = Counter[Any]
 
 
 def describe(folder: Path) -> str:
-    """README.md of the sweep in a folder.
-
-    Raises:
-        InputError: the result cannot be read.
-    """
+    """README.md of the sweep in a folder."""
     result = read_result(folder / "result.json")
     counts = count_failure_modes(result["runs"])
     return fill_template(

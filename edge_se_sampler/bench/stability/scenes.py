@@ -27,12 +27,7 @@ COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5,
 
 @lru_cache(maxsize=4)
 def render_splits(foreground: float, shifted: bool, num_train: int) -> tuple[Views, Views]:
-    """Training and held-out views.
-
-    Args:
-        foreground: share of the pixels that show the object (any alpha), a mean over the training views.
-        shifted: whether the object is off centre.
-    """
+    """Training and held-out views; foreground: share of the training views' pixels that show the object (any alpha)."""
     focal = _find_focal(foreground, num_train)
     return _render("train", focal, shifted, num_train), _render("test", focal, shifted, NUM_TEST)
 
