@@ -35,7 +35,6 @@ from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.errors import InputError
 
-NEVER = str(10**9)
 BASELINE_EVAL_SECONDS = EVAL_SECONDS[1::3]
 """Fewer than ours: some programs take minutes to render the test views."""
 
@@ -54,15 +53,10 @@ class Clock:
         self.steps, self._start = 0, 0.0
 
     def start(self) -> None:
-        """The data are about to be read."""
         self._start = self.settings.clock()
 
     def after_step(self, psnr: Callable[[], float]) -> None:
-        """Evaluate if it is time to; that takes no training time.
-
-        Raises:
-            TimeIsUp: after the last evaluation.
-        """
+        """Evaluate if it is time to; that takes no training time. TimeIsUp after the last evaluation."""
         now = self.settings.clock()
         spent = now - self._start
         self.steps += 1
@@ -124,7 +118,7 @@ def _nerf_pytorch(clock: Clock, data: Path, folder: Path, seed: int, flags: list
         "run_nerf.py", "--expname", "run", "--basedir", str(folder), "--datadir", str(data),
         "--dataset_type", "blender", "--testskip", "1", "--precrop_iters", "500", "--no_batching", "--use_viewdirs",
         "--white_bkgd", "--lrate_decay", "500", "--N_samples", "64", "--N_importance", "128", "--N_rand", "1024",
-        "--i_testset", "1", "--i_weights", NEVER, "--i_video", NEVER, *flags,
+        "--i_testset", "1", "--i_weights", "1000000000", "--i_video", "1000000000", *flags,
     ]  # fmt: skip
     _seed(seed)
     clock.start()
@@ -198,7 +192,7 @@ def _seed(seed: int) -> None:
 
 
 def version_of(checkout: Path | None) -> str:
-    """The version of nerfstudio, or the commit of a checkout."""
+    """The version of nerfstudio, or the commit of a checkout; InputError if there is none."""
     try:
         if checkout is None:
             return version("nerfstudio")

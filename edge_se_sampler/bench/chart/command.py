@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ChartOptions:
-    """What the chart and its baselines are trained on, and how long."""
-
     workplace: Path = Path("bench")
     """Where synthetic scenes are kept."""
     data: Path | None = None
@@ -36,11 +34,7 @@ class ChartOptions:
     """Of a training. One: timed in CPU seconds; more: in wall-clock time, so leave the machine alone."""
 
     def settings(self) -> ChartSettings:
-        """The checked options.
-
-        Raises:
-            InputError: a value has no meaning, or the scenes' images differ in size.
-        """
+        """InputError if a value has no meaning, or the scenes' images differ in size."""
         from edge_se_sampler.bench.chart.trials import ChartSettings
         from edge_se_sampler.data.blender import read_blender
         from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
@@ -59,7 +53,6 @@ class ChartOptions:
         return ChartSettings(self.seconds, self.threads, sizes[self.scenes[0]])
 
     def scene_folder(self, scene: str) -> Path:
-        """A scene's Blender folder; a synthetic one is rendered if it is missing."""
         from edge_se_sampler.bench.scenes import cached_scene
 
         return cached_scene(self.workplace, scene) if self.data is None else self.data / scene

@@ -16,11 +16,8 @@ from edge_se_sampler.engine.figures import require_pyplot, style_axes
 
 
 def draw_chart(runs: list[Run], baselines: Mapping[str, list[Run]], settings: ChartSettings) -> Any:
-    """PSNR over training time of the methods and their error sources, bands over seeds; baselines dotted.
-
-    Args:
-        baselines: label -> runs.
-    """
+    """PSNR over training time of the methods and their error sources, bands over seeds; baselines (label -> runs)
+    dotted."""
     figure, axis = require_pyplot().subplots(figsize=(8.8, 5.2), layout="constrained")
     compared = comparable(by_variant(runs, TOP))
     scenes = scenes_of(next(iter(compared.values())))
@@ -52,11 +49,12 @@ def draw_scenes(runs: list[Run], baselines: Mapping[str, list[Run]], settings: C
     for axis, scene in zip(axes.flat, scenes, strict=False):
         for name, found in shown.items():
             for run in (run for run in found if run["scene"] == scene):
-                _draw_run(axis, run, label=VARIANTS[name].full_label, **styles[name] | {"linewidth": 1.2})
+                seconds, *_, psnr = zip(*run["curve"], strict=True)
+                axis.plot(seconds, psnr, label=VARIANTS[name].full_label, **styles[name] | {"linewidth": 1.2})
                 if failed(run):
-                    axis.plot(run["curve"][-1][0], run["curve"][-1][-1], "x", color=styles[name]["color"])
+                    axis.plot(seconds[-1], psnr[-1], "x", color=styles[name]["color"])
         for run in (run for found in baselines.values() for run in found if run["scene"] == scene):
-            _draw_run(axis, run, label="other programs", color="black", linestyle=":", linewidth=1)
+            axis.plot(*zip(*run["curve"], strict=True), ":", label="other programs", color="black", linewidth=1)
         axis.set_title(scene)
         _set_time_axis(axis)
     for axis in axes.flat[len(scenes) :]:
@@ -71,9 +69,8 @@ def draw_scenes(runs: list[Run], baselines: Mapping[str, list[Run]], settings: C
 
 def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """The recommended variant black and wide, methods solid, error sources dashed."""
-    others = [name for name in names if name != RECOMMENDED]
     styles: dict[str, dict[str, Any]] = {RECOMMENDED: {"color": "black", "linewidth": 2.4, "zorder": 3}}
-    for i, name in enumerate(others):
+    for i, name in enumerate(name for name in names if name != RECOMMENDED):
         linestyle = "--" if VARIANTS[name].group == "errors" else "-"
         styles[name] = {"color": f"C{i % 10}", "linestyle": linestyle, "linewidth": 1.2}
     return styles
@@ -87,10 +84,6 @@ def _draw_curve(axis: Any, runs: list[Run], color: str, **style: Any) -> None:
     low, middle, high = ([mean_psnr_at(runs, t, over) for t in moments] for over in (np.min, np.median, np.max))
     axis.plot(moments, middle, color=color, **style)
     axis.fill_between(moments, low, high, color=color, alpha=0.12, linewidth=0)
-
-
-def _draw_run(axis: Any, run: Run, **style: Any) -> None:
-    axis.plot([row[0] for row in run["curve"]], [row[-1] for row in run["curve"]], **style)
 
 
 def _set_time_axis(axis: Any) -> None:

@@ -27,14 +27,11 @@ from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.tables import decimals, describe_command, markdown_table
 from edge_se_sampler.engine.figures import save_figure
 
-COLUMNS = {3: "3 s", 7: "7 s", 20: "20 s", 60: "60 s", END: "end"}
-"""Moments that tables have columns for, if trainings are so long."""
-Baselines = Mapping[str, list[Run]]
-"""Label of another program -> its runs."""
+COLUMNS = {3: "3 s", 7: "7 s", 20: "20 s", 60: "60 s", END: "end"}  # moments -> heads, if trainings are so long
+Baselines = Mapping[str, list[Run]]  # label of another program -> its runs
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
-    """Draw the pictures for which there are enough runs."""
     del workplace
     result, baselines, _ = _read(folder)
     runs, settings = result["runs"], ChartSettings(**result["settings"])

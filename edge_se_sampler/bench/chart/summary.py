@@ -20,7 +20,6 @@ END = float("inf")
 
 
 def scenes_of(runs: Iterable[Run]) -> list[str]:
-    """Scenes, in alphabetical order."""
     return sorted({run["scene"] for run in runs})
 
 

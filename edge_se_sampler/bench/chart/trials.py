@@ -33,8 +33,6 @@ from edge_se_sampler.models.ray_model import RayModel
 
 EVAL_SECONDS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)
 """Seconds of training after which the test views are evaluated."""
-PIXEL_STRIDE = 3
-"""On the way, PSNR is of every third pixel of each test view; at the end, of all."""
 PROBE_STEPS = 12
 """Steps from the end of the plan, the slower ones, whose time tells how many will fit; the first quarter is warm-up."""
 PROBE_FRACTION = 1 / 30
@@ -45,37 +43,30 @@ MAX_PLAN_ERROR = 0.1
 
 @dataclass(frozen=True)
 class ChartSettings:
-    """How long is trained, and on what."""
+    """The flags that a result depends on."""
 
     seconds: float = 60
-    """Of training; the plan, which learning rate and phases follow, is as long."""
     threads: int = 1
-    """Of a training. One: CPU seconds; more: seconds of wall-clock time."""
     image_size: int = 100
     """Longer side of the images, pixels."""
 
     @property
     def clock(self) -> Callable[[], float]:
-        """Seconds."""
         return time.process_time if self.threads == 1 else time.perf_counter
 
     @property
     def unit(self) -> str:
-        """Of the clock."""
         return "CPU seconds on one core" if self.threads == 1 else f"seconds on {self.threads} cores"
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What identifies a training."""
-
     variant: str
     scene: str
     seed: int
 
     @property
     def name(self) -> str:
-        """A name for its folder."""
         return f"{self.variant}-{self.scene}-{self.seed}"
 
 
@@ -108,25 +99,22 @@ def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run
 
 def iterations_within(config: TrainerConfig, settings: ChartSettings) -> int:
     """How many iterations fit into the training time after reading the data, at the speed of the plan's last steps."""
-    with tempfile.TemporaryDirectory() as folder:
-        planned = 10_000
+    planned, times = 10_000, []
+    start = settings.clock()
+    trainer = prepare(replace(config, max_num_iterations=planned))
+    ready = settings.clock() - start
+    for step in range(planned - PROBE_STEPS):
+        if settings.clock() - start > ready + PROBE_FRACTION * settings.seconds:
+            break
+        trainer.train_iteration(step)
+    for step in range(planned - PROBE_STEPS, planned):
         start = settings.clock()
-        trainer = prepare(replace(config, max_num_iterations=planned, output_dir=Path(folder)))
-        ready = settings.clock() - start
-        for step in range(planned - PROBE_STEPS):
-            if settings.clock() - start > ready + PROBE_FRACTION * settings.seconds:
-                break
-            trainer.train_iteration(step)
-        times = []
-        for step in range(planned - PROBE_STEPS, planned):
-            start = settings.clock()
-            trainer.train_iteration(step)
-            times.append(settings.clock() - start)
+        trainer.train_iteration(step)
+        times.append(settings.clock() - start)
     return max(PROBE_STEPS, round((settings.seconds - ready) / statistics.median(times[PROBE_STEPS // 4 :])))
 
 
 def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> Run:
-    """Train until the plan or the time is over, and evaluate on the way."""
     start = settings.clock()
     trainer = prepare(replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations))
     ready = spent = round(settings.clock() - start, 3)
@@ -154,7 +142,7 @@ def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> R
 
 def quick_psnr(model: RayModel, pictures: list[Picture]) -> float:
     """Mean PSNR over the views, each of every third pixel."""
-    rows, values = slice(None, None, PIXEL_STRIDE), []
+    rows, values = slice(None, None, 3), []
     for picture in pictures:
         rendered = render_rays(model, picture.rays(model.device)[rows]).clamp(0, 1).double()
         truth = torch.from_numpy(composite_on(picture.image, model.config.background_level)).reshape(-1, 3)[rows]

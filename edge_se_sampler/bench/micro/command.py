@@ -22,11 +22,7 @@ class MicroBenchmark:
     """Where the json and README.md go; a json of an earlier call is replaced."""
 
     def run(self) -> None:
-        """Measure and report.
-
-        Raises:
-            InputError: a flag's value has no meaning, or a file cannot be written.
-        """
+        """Measure and report; InputError if a flag's value has no meaning, or a file cannot be written."""
         from edge_se_sampler.bench.report import write_report
         from edge_se_sampler.bench.runner import new_result
         from edge_se_sampler.engine.files import make_folder, write_json

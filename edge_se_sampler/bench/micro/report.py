@@ -44,15 +44,11 @@ def describe(folder: Path) -> str:
 
 def _tabulate_scoring(result: dict[str, Any]) -> str:
     settings, times, correlation = (result[key] for key in ("settings", "milliseconds", "rank_correlation"))
-    rows = [
-        (
-            label,
-            f"{times[source] / times['random']:.2f} x",
-            f"{result['memory_against_random'][source]:.2f} x",
-            f"{correlation[source]:.2f}" if source in correlation else "1",
-        )
-        for source, label in ERROR_SOURCES.items()
-    ]
+    rows = []
+    for source, label in ERROR_SOURCES.items():
+        time, memory = times[source] / times["random"], result["memory_against_random"][source]
+        rank = f"{correlation[source]:.2f}" if source in correlation else "1"
+        rows.append((label, f"{time:.2f} x", f"{memory:.2f} x", rank))
     table = markdown_table(("squared errors from", "time per step", "peak memory", "rank correlation"), rows)
     return (
         f"Networks of size `{settings['size']}`, scene `{settings['scene']}`, {settings['rays']} pixels per step, "

@@ -25,8 +25,6 @@ from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.ranking import sample_by_rank
 
-MEMORY_RAYS = 1024
-
 
 def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
     """Build tables of noise images, size x size pixels each, and time draws from them.
@@ -49,9 +47,9 @@ def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
         # what PixelSampler.sample_method of nerfstudio 1.1.5 computes without a mask
         "nerfstudio_uniform": lambda _: (torch.rand((draws, 3)) * extent).long(),
     }
-    milliseconds = median_milliseconds(cases, rounds)
-    random_bytes, se_bytes = (training_peak(method, MEMORY_RAYS, "small") for method in ("vanilla-nerf", "se-nerf"))
-    memory = {"rays": MEMORY_RAYS, "random_bytes": random_bytes, "se_bytes": se_bytes}
+    milliseconds, rays = median_milliseconds(cases, rounds), 1024
+    random_bytes, se_bytes = (training_peak(method, rays, "small") for method in ("vanilla-nerf", "se-nerf"))
+    memory = {"rays": rays, "random_bytes": random_bytes, "se_bytes": se_bytes}
     return {"tables": tables, "milliseconds": milliseconds, "training_memory": memory}
 
 
