@@ -39,11 +39,7 @@ class ExperimentCommand(ABC):
         """What is trained; InputError if a flag's value has no meaning."""
 
     def run(self) -> None:
-        """Train and report.
-
-        Raises:
-            InputError: as `experiment`, `run_experiment` and `write_report`.
-        """
+        """Train and report; InputError as `experiment`, `run_experiment` and `write_report`."""
         from edge_se_sampler.bench.report import write_report
         from edge_se_sampler.bench.runner import executor_factory, list_trials, run_experiment
         from edge_se_sampler.bench.statistics import require_scipy_stats

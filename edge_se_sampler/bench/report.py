@@ -22,11 +22,7 @@ def report_of(folder: Path) -> Any:
     """The module that reports a folder: `describe(folder)` is its README.md, a function of the json files and of which
     pictures there are. Optional: `draw(folder, workplace)` draws the pictures, those that need renderings only where
     the workplace has them; `tables(folder)` are tables by name that other texts show. All raise InputError if the
-    result cannot be read or a picture cannot be written.
-
-    Raises:
-        InputError: no result lies there.
-    """
+    result cannot be read or a picture cannot be written, and so does this if no result lies there."""
     for path in sorted(folder.glob("**/*.json")):
         with suppress(OSError, ValueError, TypeError, KeyError):
             name = json.loads(path.read_text(encoding="utf-8"))["experiment"]
@@ -38,11 +34,7 @@ def report_of(folder: Path) -> Any:
 
 
 def write_report(folder: Path, readme: Path | None = None, workplace: Path | None = None) -> None:
-    """Write a folder's pictures and README.md, and fill its tables into another text.
-
-    Args:
-        readme: a text with `<!-- table: NAME -->` ... `<!-- end -->` markers for this experiment's tables.
-        workplace: where the experiment has left renderings that pictures show.
+    """Write a folder's pictures (of renderings in the workplace) and README.md, and fill its tables into another text.
 
     Raises:
         InputError: no result lies there, matplotlib is missing, or a file cannot be written.
@@ -57,10 +49,7 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
 
 def _fill_markers(path: Path, tables: Mapping[str, str]) -> None:
     """Replace what a text has between `<!-- table: NAME -->` and `<!-- end -->` by the tables of those names.
-
-    Raises:
-        InputError: the file cannot be read or written, or lacks a marker.
-    """
+    InputError if it cannot be read or written, or lacks a marker."""
     with os_errors_as_input_errors(f"{path}: cannot be read"):
         text = path.read_text(encoding="utf-8")
     for name, table in tables.items():
@@ -78,16 +67,14 @@ def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:
     paragraphs that begin with a picture, `![...](NAME.png)`, which does not lie in the folder.
     """
     template = Path(module_file).with_name("report.md").read_text(encoding="utf-8")
-    first, *others = re.split(r"(?m)^(?=##+ )", template)
-    text = "".join(section.format(**parts) for section in [first, *(s for s in others if not _is_empty(s, parts))])
+    text = ""
+    for section in re.split(r"(?m)^(?=##+ )", template):
+        names = [re.split(r"[.[]", name)[0] for _, name, _, _ in Formatter().parse(section) if name]
+        if not (text and names) or any(parts.get(name, "") != "" for name in names):
+            text += section.format(**parts)
     paragraphs = [
         paragraph
         for paragraph in re.split(r"\n{2,}", text.strip())
         if all((folder / picture).exists() for picture in re.findall(r"\A!\[.*?\]\((.*?)\)", paragraph))
     ]
     return "\n\n".join(paragraphs) + "\n"
-
-
-def _is_empty(section: str, parts: dict[str, object]) -> bool:
-    names = [re.split(r"[.[]", name)[0] for _, name, _, _ in Formatter().parse(section) if name]
-    return bool(names) and all(parts.get(name, "") == "" for name in names)

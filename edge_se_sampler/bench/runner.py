@@ -59,11 +59,8 @@ def list_trials(experiment: Experiment, output_dir: Path) -> None:
 
 
 def run_experiment(experiment: Experiment, output_dir: Path, new_executor: ExecutorFactory) -> dict[str, Any]:
-    """Train every pending trial; result.json is written after each.
-
-    Raises:
-        InputError: the folder cannot be written, or holds a result of other settings.
-    """
+    """Train every pending trial; result.json is written after each. InputError if the folder cannot be written, or
+    holds a result of other settings."""
     path = output_dir / "result.json"
     result = load_or_create(path, experiment.name, experiment.settings)
     trials = experiment.trials(result["runs"])
@@ -79,11 +76,8 @@ def run_experiment(experiment: Experiment, output_dir: Path, new_executor: Execu
 
 
 def load_or_create(path: Path, experiment: str, settings: Any) -> dict[str, Any]:
-    """The result of an earlier call with the same settings (a dataclass), or an empty one.
-
-    Raises:
-        InputError: the file is no result, or one of another version, experiment or settings.
-    """
+    """The result of an earlier call with the same settings (a dataclass), or an empty one; InputError if the file is no
+    result, or one of another version, experiment or settings."""
     settings = json.loads(json.dumps(asdict(settings)))
     if not path.exists():
         return new_result(experiment, settings) | {"errors": [], "runs": []}
@@ -166,19 +160,16 @@ def _store(result: dict[str, Any], trial: Any, future: Future[Run]) -> None:
     problem = future.exception()
     if isinstance(problem, (BrokenExecutor, KeyboardInterrupt)):
         raise problem
-    if problem is not None:
+    if problem is None:
+        result["runs"].append({**asdict(trial), **future.result()})
+        result["runs"].sort(key=lambda run: [run[key] for key in asdict(trial)])
+    else:
         result["errors"].append({**asdict(trial), "error": f"{type(problem).__name__}: {problem}"})
-        return
-    result["runs"].append({**asdict(trial), **future.result()})
-    result["runs"].sort(key=lambda run: [run[key] for key in asdict(trial)])
 
 
 def executor_factory(workers: int, scheduler: str | None) -> ExecutorFactory:
     """What makes the executor: processes of this machine, or those of a dask cluster by its scheduler's address.
-
-    Raises:
-        InputError: the [cluster] extra is missing, or nobody answers at the address.
-    """
+    InputError if the [cluster] extra is missing, or nobody answers at the address."""
     if scheduler is None:
         spawn = multiprocessing.get_context("spawn")  # a forked torch may hang
         return lambda: ProcessPoolExecutor(workers, spawn, _initialize_worker)

@@ -10,10 +10,9 @@ from edge_se_sampler.engine.progress import Progress
 
 
 def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
-    """The Blender folder of a synthetic scene in workplace/scenes, rendered if it is not there.
+    """The Blender folder of one of the seven synthetic scenes in workplace/scenes, rendered if it is not there.
 
     Args:
-        name: one of the seven.
         options: of `make_scenes`: size, placement, num_train, ...; scenes of other options lie in other folders.
 
     Raises:

@@ -30,11 +30,7 @@ Runs = dict[Trial, Run]
 
 
 def draw_figures(runs: list[Run], views: Path, folder: Path) -> None:
-    """Draw every picture of which all runs and renderings are there; leave the others as they are.
-
-    Raises:
-        InputError: matplotlib is missing, or a file cannot be written.
-    """
+    """Draw every picture of which all runs and renderings are there; leave the others as they are."""
     for name, draw in {"sheet": _sheet, "figure-2": _figure_2, "figure-5": _figure_5, "figure-6": _figure_6}.items():
         with suppress(FileNotFoundError):
             figure = draw(runs_by_trial(runs), views)

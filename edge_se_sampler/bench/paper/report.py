@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Iterable
 from pathlib import Path
 
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
@@ -37,6 +38,8 @@ def describe(folder: Path) -> str:
     size = "{image_size} x {image_size} pixels, {num_train} training views (or 10 of them) and {num_test} test views"
     numbers = [number for number in TABLES if any(run["table"] == number for run in runs)]
     tables = [f"**Table {number}: {TABLES[number].title}**\n\n{psnr_table(number, runs)}" for number in numbers]
+    summary = [[label, *_psnr_cells(runs, strategy, PAPER_TABLES)] for strategy, label in LABELS.items()]
+    cures = [[cure, *_psnr_cells(runs, "vanilla-nerf", numbers)] for cure, numbers in OTHER_CURES.items()]
     return fill_template(
         __file__,
         folder,
@@ -46,9 +49,9 @@ def describe(folder: Path) -> str:
         samples=" + ".join(map(str, settings["samples"] or ["the paper's number of"])),
         dead=sum(bool(run["dead_at_start"]) for run in runs),
         failure_rule=FAILURE_RULE,
-        summary=_summarize(runs),
+        summary=markdown_table(["", *(table.title for table in PAPER_TABLES.values())], summary),
         claims=markdown_table(["claim", "whose", "verdict", "intervals"], map(_claim_row, claims)),
-        other_cures=_compare_other_cures(runs),
+        other_cures=markdown_table(["Random with", "NeRF, all views, centred", "off centre"], cures),
         margin=MIN_DIFFERENCE,
         comparisons="\n\n".join(map(_describe_claim, claims)),
         tables="\n\n".join(tables),
@@ -101,23 +104,9 @@ def format_psnr(runs: list[Run], reference: float | None = None) -> str:
     return text if reference is None else f"{text} <sub>{reference:.2f}</sub>"
 
 
-def _summarize(runs: list[Run]) -> str:
-    """Mean PSNR and failures of every strategy in the paper's tables."""
-    selected = [select_runs(runs, number) for number in PAPER_TABLES]
-    rows = [
-        [label, *(format_psnr([run for run in of_table if run["strategy"] == strategy]) for of_table in selected)]
-        for strategy, label in LABELS.items()
-    ]
-    return markdown_table(["", *(table.title for table in PAPER_TABLES.values())], rows)
-
-
-def _compare_other_cures(runs: list[Run]) -> str:
-    """PSNR and failures of Random with other densities and initial weights."""
-    rows = []
-    for cure, numbers in OTHER_CURES.items():
-        selected = [[run for run in select_runs(runs, n) if run["strategy"] == "vanilla-nerf"] for n in numbers]
-        rows.append([cure, *map(format_psnr, selected)])
-    return markdown_table(["Random with", "NeRF, all views, centred", "off centre"], rows)
+def _psnr_cells(runs: list[Run], strategy: str, tables: Iterable[int]) -> list[str]:
+    """A strategy's mean PSNR and failures in each table."""
+    return [format_psnr([run for run in select_runs(runs, n) if run["strategy"] == strategy]) for n in tables]
 
 
 def _claim_row(entry: ClaimVerdict) -> list[str]:

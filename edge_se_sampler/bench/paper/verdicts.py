@@ -29,7 +29,6 @@ EDGE_AGAINST_PRECROP = {EDGE: PRECROP, EDGE_SE: PRECROP_SE}
 Kind = Literal["better", "not inferior", "prevents failures"]
 Verdict = Literal["not supported", "undecided", "supported", "nothing to compare"]
 """The worst first."""
-PSNR, EDGE_BAND = "psnr", "edge_band_psnr"
 
 
 @dataclass(frozen=True)
@@ -40,14 +39,14 @@ class Comparison:
     """Table and strategy."""
     baseline: tuple[int, str]
     minus_table: int | None = None
-    measure: str = PSNR
+    measure: Literal["psnr", "edge_band_psnr"] = "psnr"
 
     @property
     def label(self) -> str:
         strategies = " against ".join(dict.fromkeys(LABELS[strategy] for _, strategy in (self.arm, self.baseline)))
         tables = " against ".join(dict.fromkeys(str(table) for table, _ in (self.arm, self.baseline)))
         minus = "" if self.minus_table is None else f", minus that in table {self.minus_table}"
-        return f"{strategies}, table {tables}{minus}" + " (edge band)" * (self.measure == EDGE_BAND)
+        return f"{strategies}, table {tables}{minus}" + " (edge band)" * (self.measure == "edge_band_psnr")
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ CLAIMS = (
     Claim("Sobel edges are better than Laplacian ones", "section 4.1.4", "better",
           _compare_tables(EDGE, (1, 13))),
     Claim("Edge regions get sharper with Edge than with Precrop", "section 5", "better",
-          _compare_in((1, 3), {EDGE: PRECROP}, measure=EDGE_BAND)),
+          _compare_in((1, 3), {EDGE: PRECROP}, measure="edge_band_psnr")),
     Claim("Precrop fails because of where the object is, not because it is small", "ours", "prevents failures",
           _compare_tables(PRECROP, (16, 2))),
     Claim("A softplus density alone keeps Random from failing", "ours", "prevents failures",
@@ -127,12 +126,12 @@ CLAIMS = (
 
 def evaluate_claims(runs: list[Run]) -> list[ClaimVerdict]:
     """What the runs say of every claim for which there are pairs of runs."""
-    by_trial = runs_by_trial(runs)
-    verdicts = []
+    by_trial, verdicts = runs_by_trial(runs), []
     for claim in CLAIMS:
         compared = [_compare(comparison, claim.kind, by_trial) for comparison in claim.comparisons]
-        verdicts.append(ClaimVerdict(claim, [row for row in compared if row.pairs]))
-    return [verdict for verdict in verdicts if verdict.rows]
+        if rows := [row for row in compared if row.pairs]:
+            verdicts.append(ClaimVerdict(claim, rows))
+    return verdicts
 
 
 def _compare(comparison: Comparison, kind: Kind, by_trial: dict[Trial, Run]) -> ComparedRuns:

@@ -90,14 +90,10 @@ def _describe_failures(runs: list[Run]) -> dict[str, Any]:
     for table in CONFIGURATIONS:
         by_scene = [[pair for key, pair in pairs.items() if key[:2] == (table, scene)] for scene in SCENES]
         rows.append([TABLES[table].title, *map(_count_failures, by_scene)])
-    return {
+    counts = {"pairs": len(pairs), "random": random, "adaptive": adaptive, "low": low, "high": high}
+    return counts | {
         "iterations": trained[0]["iterations"],
         "failure_rule": FAILURE_RULE,
-        "pairs": len(pairs),
-        "random": random,
-        "adaptive": adaptive,
-        "low": low,
-        "high": high,
         "reinitialized": sum(run["reinitialized"] > 0 for run in trained),
         "failures": markdown_table(["", *SCENES], rows),
     }
