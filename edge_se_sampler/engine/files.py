@@ -63,12 +63,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def write_image(path: Path, image: np.ndarray) -> None:
     """Write an (H, W, 3) float image in [0, 1] as PNG."""
-    write_atomically(path, png_bytes(image))
-
-
-def png_bytes(image: np.ndarray) -> bytes:
-    """An (H, W, 3) float image in [0, 1] as a PNG file's content."""
-    return iio.imwrite("<bytes>", to_uint8(image), extension=".png")
+    write_atomically(path, iio.imwrite("<bytes>", to_uint8(image), extension=".png"))
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -105,11 +105,7 @@ class ModelConfig(InstantiateConfig):
         return False
 
     def check(self, prefix: str = "") -> None:
-        """Raise InputError if a value is out of its range, in a config whose size is decided.
-
-        Args:
-            prefix: of the flags' names in the message.
-        """
+        """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
         if not 0 <= self.near < self.far < INFINITY:
             raise InputError(f"--{prefix}near is {self.near}, --{prefix}far {self.far}: 0 <= near < far")
         size_px, preset = self.voxel_size_px, self.preset
@@ -233,5 +229,4 @@ def apply_preset(config: Model, rays: int) -> Model:
     """A config whose size is decided, with every None replaced by the size's number; as many unseen rays as `rays`,
     those of a training step."""
     preset = vars(config.presets[config.size]) | {"num_unseen_rays": rays}
-    left_open = [key for key, value in vars(config).items() if value is None and key in preset]
-    return replace(config, **{key: preset[key] for key in left_open})
+    return replace(config, **{key: preset[key] for key in preset if getattr(config, key, 0) is None})

@@ -89,11 +89,8 @@ def linear(in_size: int, out_size: int) -> nn.Linear:
 
 @torch.no_grad()
 def initialize_linear(module: nn.Module, scheme: str, rng: np.random.Generator) -> None:
-    """Draw the initial weights of a module's linear layers.
-
-    Scheme "xavier": uniform in +-sqrt(6 / (in + out)), zero bias, as the original TensorFlow NeRF; "torch": weight and
-    bias uniform in +-1 / sqrt(in), what the PyTorch ports start from.
-    """
+    """Draw the initial weights of a module's linear layers. Scheme "xavier": uniform in +-sqrt(6 / (in + out)), zero
+    bias, as the original TensorFlow NeRF; "torch": weight and bias uniform in +-1 / sqrt(in), as its PyTorch ports."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             out_size, in_size = layer.weight.shape

@@ -82,11 +82,8 @@ class RayModel(nn.Module, ABC):
         return torch.zeros(len(rays), device=self.device)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """The loss of every ray, (n,), and the fine network's squared errors, (n,), detached.
-
-        The loss is the squared error, a mean over channels as in NeRF's code, summed over the networks, and times
-        batch["weight"] (n,) if there is one.
-        """
+        """Squared errors of every ray, (n,), a mean over channels as in NeRF's code, summed over the networks, and
+        times batch["weight"] (n,) if there is one; and the fine network's squared errors, (n,), detached."""
         error = fine = self.squared_error(outputs, batch["image"], "fine")
         for network in self.networks[:-1]:
             error = self.squared_error(outputs, batch["image"], network) + error

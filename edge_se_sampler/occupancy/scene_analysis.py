@@ -68,8 +68,7 @@ def analyze_scene(
             "no training view sees anything of what lies between --pipeline.model.near and far around "
             f"({', '.join(f'{x:.2f}' for x in box.center)}): check the cameras' poses and principal points"
         )
-    coarsening = 1 if prunable and silhouettes else 0
-    max_level = coarsening
+    coarsening = max_level = int(prunable and bool(silhouettes))
     if prunable and not silhouettes:
         wanted, possible = np.log2(hull.cell_size / cell_size), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3
         max_level = max(0, int(min(np.round(wanted), np.floor(possible))))

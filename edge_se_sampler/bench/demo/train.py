@@ -28,10 +28,8 @@ METHODS = {"vanilla-nerf": "Random", "edge-se-nerf": "Edge + SE"}
 
 
 def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
-    """Render the scene, train both methods, and leave demo.png and demo.json in output_dir, scene and runs in demo/.
-
-    Returns:
-        the content of demo.json.
+    """Render the scene, train both methods, and leave demo.png and demo.json in output_dir, scene and runs in demo/;
+    the content of demo.json is returned.
 
     Raises:
         InputError: output_dir cannot be written, or matplotlib is missing.

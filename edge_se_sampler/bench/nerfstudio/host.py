@@ -14,12 +14,7 @@ import torch
 
 
 def build_config(method: str, seed: int, data: Path, runs: Path, flags: Sequence[str] = ()) -> Any:
-    """A method's config on a Blender folder, without evaluations on the way.
-
-    Args:
-        runs: folder for nerfstudio's outputs.
-        flags: as ns-train takes them.
-    """
+    """A method's config on a Blender folder, without evaluations on the way; flags: as ns-train takes them."""
     import tyro
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig

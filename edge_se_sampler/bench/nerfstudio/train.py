@@ -58,12 +58,10 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """For the terminal."""
         return f"{self.method}, seed {self.seed}"
 
 
 def render_scene(workplace: Path) -> Path:
-    """The scene's Blender folder, kept in the workplace."""
     return cached_scene(workplace, TrainingSettings.scene, **SCENE_OPTIONS)
 
 

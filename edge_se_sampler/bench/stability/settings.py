@@ -91,5 +91,4 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """For the terminal."""
         return f"{self.setting}: {self.strategy}, seed {self.seed}"

@@ -56,7 +56,6 @@ class Rendered:
 
     @property
     def outcome(self) -> Outcome:
-        """By the rule of all experiments."""
         return classify(self.psnr, self.background_psnr, self.share)
 
     def failure_mode(self, dead_at_start: bool) -> str | None:
