@@ -1,8 +1,6 @@
 """Results of other programs (baselines), shown beside ours: DIR/baselines/*.json of a chart's folder DIR.
 
-`edge-se bench baselines` writes them in the format of every result (see `bench.runner`). Their settings are
-`BaselineSettings`; a run has scene, seed and curve: rows of training seconds, from reading the data on, and PSNR, the
-mean over the same test views.
+A run has scene, seed and curve: rows of training seconds, from reading the data on, and mean PSNR of the test views.
 """
 
 from __future__ import annotations

@@ -73,9 +73,6 @@ class Clock:
 def train(settings: BaselineSettings, checkout: Path | None, data: Path, seed: int) -> Run:
     """Steps and curve of a training; to be called in a fresh process, because programs change what is global.
 
-    Args:
-        checkout: None where this environment has the program.
-
     Raises:
         InputError: the program is not there, refuses its flags or ends too soon.
     """

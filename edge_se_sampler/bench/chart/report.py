@@ -42,7 +42,7 @@ def draw(folder: Path, workplace: Path | None) -> None:
 
 
 def describe(folder: Path) -> str:
-    """The README.md; remarks by hand, which no number of the result shows, are in notes.md."""
+    """The README.md; notes.md has remarks by hand, which no number of the result shows."""
     result, baselines, baseline_results = _read(folder)
     runs, settings, notes = result["runs"], ChartSettings(**result["settings"]), folder / "notes.md"
     return fill_template(

@@ -27,12 +27,8 @@ from edge_se_sampler.sampling.ranking import sample_by_rank
 
 
 def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
-    """Build tables of noise images, size x size pixels each, and time draws from them.
-
-    Returns:
-        `tables` (`build_tables`), median `milliseconds` of each kind of draw, and `training_memory`, the bytes that
-        training at random and by squared error holds at its peak.
-    """
+    """`tables` (`build_tables`), median `milliseconds` of each kind of draw, and `training_memory`, the bytes that
+    training at random and by squared error holds at its peak."""
     table, tables = build_tables(images, size)
     every_image, one_image = torch.arange(images), torch.tensor([images // 2])
     uniform = UniformPixels([(size, size)] * images)

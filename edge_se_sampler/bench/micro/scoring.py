@@ -28,7 +28,7 @@ ERROR_SOURCES = ("fine", "coarse", "cached")
 
 
 def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
-    """Measure on a synthetic scene; the arguments are the flags of `BenchScoring`.
+    """Measure on a synthetic scene.
 
     Returns:
         median `milliseconds` per step of Random and of each error source, `memory_against_random` of each error source
