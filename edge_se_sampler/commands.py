@@ -99,13 +99,10 @@ class Train:
 
 @dataclass(frozen=True)
 class _RunCommand:
-    """A command on a run."""
-
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
 
     def _load(self) -> tuple[RunFolder, TrainerConfig]:
-        """The run, and its settings; InputError if there is none."""
         from edge_se_sampler.engine.run_folder import RunFolder
 
         run = RunFolder(self.run_folder)

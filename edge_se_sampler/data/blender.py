@@ -20,7 +20,6 @@ from edge_se_sampler.data.views import Views
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 
-_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 # of the image and its camera, all in pixels: for one frame, or at the top of the file for all frames
 _INTRINSICS = {
@@ -31,13 +30,10 @@ _INTRINSICS = {
     "fl_x": JsonValue.positive_number,
     "fl_y": JsonValue.positive_number,
 }
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """An entry of `frames`, checked as far as possible without reading its images."""
-
     location: SourceLocation
     file_path: str
     image: SourceFile
@@ -55,7 +51,7 @@ def transforms_path(folder: Path, split: str) -> Path:
 
 def listed_file(path: str) -> str:
     """The file, relative to the folder, that a file_path or mask_path means: .png may be left out."""
-    return path if path.lower().endswith(_SUFFIXES) else f"{path}.png"
+    return path if path.lower().endswith((".png", ".jpg", ".jpeg")) else f"{path}.png"
 
 
 def has_split(folder: Path, split: str) -> bool:
@@ -122,8 +118,7 @@ def _read_frame(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
 
 
 def _read_intrinsics(parent: JsonValue) -> dict[str, JsonValue]:
-    """The checked intrinsics that the file or a frame states."""
-    for key in _DISTORTION:
+    for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
         coefficient = parent.optional(key)
         if coefficient is not None and coefficient.number() != 0:
             problem = f"is {quote(coefficient.value)}, but lens distortion is not supported"

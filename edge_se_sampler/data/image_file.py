@@ -45,7 +45,6 @@ def read_image(file: SourceFile) -> np.ndarray:
 
 
 def _check_png(data: bytes, file: SourceFile) -> None:
-    """Raise InputError for what pillow would let pass, or not name."""
     if not _is_complete_png(data):
         raise file.error("is truncated or damaged", _COPY_AGAIN)
     width, height, depth = data[16:20], data[20:24], data[24:25]  # of IHDR, which is always the first chunk

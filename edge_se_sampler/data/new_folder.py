@@ -43,7 +43,6 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
 
 
 def _check_not_taken(out: Path, targets: Sequence[Path]) -> None:
-    """Raise InputError unless every target, a path in `out`, can be written without touching anything there."""
     try:
         existing = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
         if not existing.is_dir():

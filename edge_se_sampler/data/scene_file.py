@@ -47,8 +47,6 @@ class SourceLocation:
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file to read, and where it is named."""
-
     path: Path  # with links resolved
     location: SourceLocation  # the field that names the file; the file itself if none does
     name: str = ""  # how the field names it; "" if none does

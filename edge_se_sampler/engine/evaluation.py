@@ -21,12 +21,9 @@ from edge_se_sampler.models.ray_model import RayModel
 def evaluate(
     model: RayModel, pictures: list[Picture], on_view: Callable[[int, Picture, np.ndarray], None] | None = None
 ) -> dict[str, Any]:
-    """Render every picture and compare all of its pixels, masked ones included.
-
-    Calls on_view with index, picture and rendering (H, W, 3) of every view. Returns the mean of every metric over the
-    views, psnr_std, psnr_pooled (of the mean mse), num_images, and `images`, the metrics of each. lpips is None: its
-    weights are not part of this package.
-    """
+    """Render every picture and compare all of its pixels, masked ones included; on_view gets index, picture and
+    rendering (H, W, 3). Returns the mean of every metric over the views, psnr_std, psnr_pooled (of the mean mse),
+    num_images, and `images`, the metrics of each. lpips is None: its weights are not part of this package."""
     rows = []
     for i, picture in enumerate(pictures):
         rendered, _ = render_view(model, picture)

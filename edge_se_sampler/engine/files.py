@@ -1,7 +1,4 @@
-"""Outputs: checked before the work, written completely or not at all.
-
-Every function that checks or writes a file or folder raises InputError if that cannot be written.
-"""
+"""Outputs: checked before the work, written completely or not at all; InputError if they cannot be written."""
 
 from __future__ import annotations
 
@@ -67,5 +64,4 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Floats, clipped to [0, 1], as uint8."""
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

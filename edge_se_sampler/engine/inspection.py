@@ -13,7 +13,7 @@ from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
 from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.hull import Hull, find_hit_pixels
+from edge_se_sampler.occupancy.hull import find_hit_pixels
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
 from edge_se_sampler.sampling.edges import unit_float
 
@@ -21,16 +21,24 @@ NUM_VIEWS = 3  # in the picture
 
 
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
-    """What is derived from training views, one finding a line; draws it too. The config's size may be auto. InputError
-    if a setting is out of its range, matplotlib is missing, or the picture cannot be written."""
+    """What is derived from training views, one finding a line; draws it too. InputError for bad settings or outputs."""
     pyplot = require_pyplot()
     config = decide_size(config, views.images)
     config.check()
     analysis = analyze_views(views, config)
-    hit_pixels = find_hit_pixels(views, analysis.hull)
+    hull, hit_pixels = analysis.hull, find_hit_pixels(views, analysis.hull)
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
-    _draw_hull(axes[0], analysis.hull)
-    _draw_views(axes[1], views, hit_pixels)
+    ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
+    for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
+        right, up = (other for other in range(3) if other != along)
+        extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
+        axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
+        axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
+    chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
+    for axis, k in zip(axes[1], chosen, strict=True):  # dark where rays miss the hull
+        color = composite_on(unit_float(views.images[k]))
+        axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
+        axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")
     figure.tight_layout()
     save_figure(figure, path)
     return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, hit_pixels, config).items())
@@ -39,7 +47,6 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
 def _findings(
     views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
 ) -> dict[str, str]:
-    """Each quantity's value, and where it comes from."""
     hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.box.pixel_footprint
     num_views, num_occupied = len(views.images), hull.cells.sum()
     sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
@@ -72,22 +79,3 @@ def _findings(
         if analysis.num_silhouettes
         else "by edges as long as they pay, for nothing tells where the object is",
     }
-
-
-def _draw_hull(axes: np.ndarray, hull: Hull) -> None:
-    """The hull seen along three axes: how many cells lie one after another."""
-    ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
-    for axis, along in zip(axes, (1, 0, 2), strict=True):
-        right, up = (other for other in range(3) if other != along)
-        extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
-        axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
-        axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
-
-
-def _draw_views(axes: np.ndarray, views: Views, hit_pixels: list[np.ndarray]) -> None:
-    """Some views, with the pixels dark whose rays miss the hull."""
-    chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
-    for axis, k in zip(axes, chosen, strict=True):
-        color = composite_on(unit_float(views.images[k]))
-        axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
-        axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")

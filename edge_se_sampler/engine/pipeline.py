@@ -43,10 +43,9 @@ class Pipeline:
             analysis = analyze_views(views, model_config)
             grid, has_masks = analysis.grid(), analysis.num_silhouettes > 0
             if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
-                raise InputError(
-                    "the scene's cells are not the checkpoint's: its images, masks or cameras have changed since, or "
-                    "this machine rounds differently; restore the data, or begin a new training"
-                )
+                changed = "its images, masks or cameras have changed since, or this machine rounds differently"
+                remedy = "restore the data, or begin a new training"
+                raise InputError(f"the scene's cells are not the checkpoint's: {changed}; {remedy}")
             if manager_config.skip_empty_rays and has_masks:
                 views = views.with_masks(find_hit_pixels(views, analysis.hull))
         if isinstance(manager_config.pixel_sampler, SamplingSettings):

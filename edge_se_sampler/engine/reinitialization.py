@@ -41,16 +41,12 @@ class DeadNetworkReset:
 
     def after_backward(self) -> dict[str, int]:
         """Look at a step's gradients, reinitialize what is dead, and return each such network's name -> sub-seed."""
-        suspects = []
-        for name in self.model.networks:
-            gradient = getattr(self.model, name).density.weight.grad
-            self.steps_without_gradient[name] = 0 if gradient.any() else self.steps_without_gradient[name] + 1
-            if self.steps_without_gradient[name] >= PATIENCE:
-                suspects.append(name)
-                self.steps_without_gradient[name] = 0
-        if not suspects:
-            return {}
-        dead = [name for name in dead_networks(self.model, [self.probe]) if name in suspects]
+        counts = self.steps_without_gradient
+        for name in counts:
+            counts[name] = 0 if getattr(self.model, name).density.weight.grad.any() else counts[name] + 1
+        suspects = [name for name, count in counts.items() if count >= PATIENCE]
+        counts.update(dict.fromkeys(suspects, 0))
+        dead = [name for name in dead_networks(self.model, [self.probe]) if name in suspects] if suspects else []
         return {name: self._reinitialize(getattr(self.model, name)) for name in dead}
 
     def _reinitialize(self, field: NeRFField) -> int:

@@ -29,11 +29,7 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 
 def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: OccupancyGrid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
-
-    Args:
-        run: the folder of a run to continue; by default a new one.
-        grid: the occupancy grid in that run's checkpoint; by default the scene's.
-    """
+    A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
     views, device = read_train_views(config), choose_device(config.machine.device_type)
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else to_pictures(held_out)[0]
@@ -97,7 +93,6 @@ def read_test_views(config: TrainerConfig) -> Views:
 
 
 def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views | None:
-    """The first of the splits that has views."""
     assert config.data is not None
     found = (read_blender(config.data, split) for split in splits if has_split(config.data, split))
     return next((views for views in found if views.names), None)

@@ -59,12 +59,13 @@ def render_run(
 
 def check_video(path: Path, frames_per_second: int) -> None:
     """InputError if `write_video` cannot write such a file."""
-    if path.suffix.lower() == ".gif" and frames_per_second > 50:
+    suffix = path.suffix.lower()
+    if suffix == ".gif" and frames_per_second > 50:
         raise InputError(f"--frames-per-second is {frames_per_second}: a GIF has at most 50; use .mp4")
-    if path.suffix.lower() not in (".gif", ".mp4"):
+    if suffix not in (".gif", ".mp4"):
         raise InputError(f"--output-path {path}: must end in .gif or .mp4")
     check_output(path)
-    if path.suffix.lower() == ".mp4":
+    if suffix == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401
         except ImportError:

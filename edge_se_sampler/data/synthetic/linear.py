@@ -48,7 +48,6 @@ def ring(radius: float, corners: int, z: float = 0.0) -> list[Array]:
 
 
 def spaced(first: float, last: float, count: int) -> list[float]:
-    """`count` numbers from first to last, evenly."""
     return [first + (last - first) * k / (count - 1) for k in range(count)]
 
 

@@ -17,7 +17,6 @@ from edge_se_sampler.data.synthetic.visibility import NOTHING, first_hits
 
 SAMPLES_PER_AXIS = 4
 _BATCH = 1 << 16  # points shaded together: bounds the memory
-_BRIGHTEST = 4.0  # radiance of one sample is clipped here, so that a glint does not bleach its whole pixel
 
 _ENCODED = [(code - 0.5) / 255 for code in range(1, 256)]
 # Linear values (255,) at which the 8-bit sRGB code rises by one; rounded, they are the same on every platform's pow
@@ -38,7 +37,7 @@ def render(scene: Scene, camera: Camera) -> NDArray[np.uint8]:
         slopes = np.stack([x_slopes[column], y_slopes[row], np.full(len(row), -1.0)])
         rays = apply(camera.to_world[:3, :3], slopes)
         points = camera.to_world[:3, 3:4] + depth[row, column] * rays
-        light = np.minimum(radiance(scene, seen[row, column], points, unit(rays)), _BRIGHTEST)
+        light = np.minimum(radiance(scene, seen[row, column], points, unit(rays)), 4)  # no glint bleaches its pixel
         for channel in range(3):
             total[channel] += np.bincount(pixels[batch], weights=light[channel], minlength=count)
 

@@ -20,7 +20,6 @@ from edge_se_sampler.data.synthetic.solids import Kind
 # World units. Small enough that the default offset keeps the ball's image whole when the cameras are rotated instead
 # of shifted, which stretches what is off the axis; the centered frame would hold a ball of 1.36.
 BALL_RADIUS = 1.15
-_DECIMALS = 12  # of every matrix: swallows the last bits in which one platform's sin differs from another's
 
 _UPRIGHT = np.eye(3)
 _CUBE = vector(list(product((-1, 1), repeat=3))).T  # corners (3, 8) of the unit box, which holds every unit solid
@@ -136,7 +135,8 @@ class SceneBuilder:
         half_extent = np.abs(linear[:, 0]) + np.abs(linear[:, 1]) + np.abs(linear[:, 2])
         middle = ((center - half_extent).min(axis=1) + (center + half_extent).max(axis=1)) / 2
         scale = (BALL_RADIUS - 1e-9) / max(solid.reach(middle) for solid in solids)  # 1e-9: room for the rounding
-        to_world = np.round(affine(scale * linear, scale * (center - middle[:, None])), _DECIMALS)
+        # 12 decimals: without the last bits, in which one platform's sin differs from another's
+        to_world = np.round(affine(scale * linear, scale * (center - middle[:, None])), 12)
 
         kind = np.array([solid.kind for solid in solids])
         half_diagonals = apply(to_world[:, :3, None], _CUBE[..., None])  # (3, 8, P)

@@ -27,8 +27,6 @@ _SOFT_BOXES = (  # direction, color, cosine of the angle at which it ends
     (unit([-0.6, -0.5, 0.62]), vector([2.6, 2.5, 2.4])[:, None], 0.90),
     (unit([0.1, 0.85, 0.5]), vector([1.5, 1.6, 1.9])[:, None], 0.95),
 )
-_MIRROR_ROUGHNESS = 0.19  # smoother materials mirror the scene, not the sky alone
-_OFF_SURFACE = 1e-4  # world units by which a secondary ray starts above the surface
 
 
 def radiance(scene: Scene, solid: Index, points: Array, rays: Array, *, bounces: int = 1) -> Array:
@@ -39,7 +37,7 @@ def radiance(scene: Scene, solid: Index, points: Array, rays: Array, *, bounces:
     roughness, metalness = material["roughness"], material["metalness"]
     albedo = _albedo(material, local, points)
 
-    above = points + _OFF_SURFACE * normals
+    above = points + 1e-4 * normals  # where secondary rays start
     cos_key = np.maximum(dot(normals, KEY_DIRECTION), 0)
     lit = cos_key > 0
     up = 0.5 + 0.5 * normals[2]
@@ -54,7 +52,7 @@ def radiance(scene: Scene, solid: Index, points: Array, rays: Array, *, bounces:
     mirrored = rays + 2 * cos_eye * normals
     surroundings = _sky(mirrored, roughness)
     if bounces > 0:
-        smooth = np.nonzero(roughness < _MIRROR_ROUGHNESS)[0]
+        smooth = np.nonzero(roughness < 0.19)[0]  # these mirror the scene, not the sky alone
         _mirror(scene, surroundings, smooth, above, mirrored)
 
     straight_on = (1 - metalness) * material["reflectance"] + metalness * albedo
@@ -76,7 +74,6 @@ def _surface(scene: Scene, solid: Index, points: Array, rays: Array) -> tuple[Ar
 
 
 def _mirror(scene: Scene, surroundings: Array, which: Index, origins: Array, directions: Array) -> None:
-    """Puts what rays `which` meet in the scene into `surroundings`, over the sky."""
     origins, directions = origins[:, which], directions[:, which]
     t, met = nearest_hits(scene, origins, directions)
     hit = np.nonzero(met != NOTHING)[0]

@@ -22,7 +22,6 @@ NOTHING = -1  # the index of no solid
 
 _KEY_ASIDE = unit(cross(KEY_DIRECTION, vector([0, 0, 1])))
 _KEY_FRAME = np.stack([_KEY_ASIDE, cross(KEY_DIRECTION, _KEY_ASIDE), KEY_DIRECTION])  # rows: u, v, toward the light
-_SELF = 1e-5  # a ray that starts on a surface does not meet it again within this t
 
 
 def first_hits(scene: Scene, camera: Camera, per_axis: int) -> tuple[Array, Index]:
@@ -90,7 +89,8 @@ def _hit(scene: Scene, solid: int, origins: Array, directions: Array) -> Array:
     """Where rays from other surfaces, (3, n) with directions (3, n) or (3,), meet one solid: t (n,)."""
     linear, translation = scene.to_local[:, :3, solid], scene.to_local[:, 3:, solid]
     origins, directions = apply(linear, origins) + translation, apply(linear, directions)
-    return hit_distance(scene.kind[solid], scene.taper[:, solid], origins, directions, _SELF)
+    # 1e-5: a ray that starts on a surface does not meet it again
+    return hit_distance(scene.kind[solid], scene.taper[:, solid], origins, directions, 1e-5)
 
 
 def nearest_hits(scene: Scene, origins: Array, directions: Array) -> tuple[Array, Index]:

@@ -24,7 +24,18 @@ Point = tuple[float, float, float]
 def bricks(scene: SceneBuilder) -> None:
     _brick(scene, (0, 0, -0.62), (18, 12, 0.02), GREEN)
     for y in (-0.36, 0.36):
-        _track(scene, y)
+        # a track
+        for x in (-0.5, -0.25, 0, 0.25):
+            scene.tube((x, y - 0.1, -0.45), (x, y + 0.1, -0.45), 0.11, GRAY)
+            scene.tube((x, y - 0.12, -0.45), (x, y + 0.12, -0.45), 0.04, RED)
+        for k in range(11):
+            for z in (-0.57, -0.33):
+                scene.box((-0.55 + 0.085 * k, y, z), (0.037, 0.13, 0.018), DARK)
+        for degrees in spaced(-75, 75, 5):
+            out, up = 0.12 * math.cos(math.radians(degrees)), 0.12 * math.sin(math.radians(degrees))
+            for side, x in ((1, 0.28), (-1, -0.53)):
+                tilt = rotation((0, 1, 0), -side * degrees)
+                scene.box((x + side * out, y, -0.45 + up), (0.018, 0.13, 0.035), DARK, tilt)
     # body
     _brick(scene, (-0.1, 0, -0.26), (8, 5, 0.05), YELLOW, studs=False)
     _brick(scene, (-0.3, 0, -0.16), (5, 5, 0.05), GRAY)
@@ -60,17 +71,3 @@ def _brick(
     for i, j in product(range(across), range(deep)) if studs else ():
         foot = vector(center) + vector([(i - (across - 1) / 2) * STUD, (j - (deep - 1) / 2) * STUD, half_height])
         scene.tube(foot, foot + vector([0, 0, 0.028]), 0.031, material)
-
-
-def _track(scene: SceneBuilder, y: float) -> None:
-    for x in (-0.5, -0.25, 0, 0.25):
-        scene.tube((x, y - 0.1, -0.45), (x, y + 0.1, -0.45), 0.11, GRAY)
-        scene.tube((x, y - 0.12, -0.45), (x, y + 0.12, -0.45), 0.04, RED)
-    for k in range(11):
-        for z in (-0.57, -0.33):
-            scene.box((-0.55 + 0.085 * k, y, z), (0.037, 0.13, 0.018), DARK)
-    for degrees in spaced(-75, 75, 5):
-        out, up = 0.12 * math.cos(math.radians(degrees)), 0.12 * math.sin(math.radians(degrees))
-        for side, x in ((1, 0.28), (-1, -0.53)):
-            tilt = rotation((0, 1, 0), -side * degrees)
-            scene.box((x + side * out, y, -0.45 + up), (0.018, 0.13, 0.035), DARK, tilt)
