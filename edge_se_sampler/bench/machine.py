@@ -1,4 +1,4 @@
-"""Where a number was measured."""
+"""The machine that numbers are measured on; memory and time."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import contextlib
 import os
 import platform
 import resource
+import statistics
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy
 import torch
 
 from edge_se_sampler import __version__
+from edge_se_sampler.engine.progress import Progress
 
 
 def machine() -> dict[str, Any]:
@@ -38,6 +42,20 @@ def resident_memory(what: str = "VmRSS") -> int:
         return 1024 * int(kilobytes.split()[0])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if platform.system() == "Darwin" else peak * 1024
+
+
+def median_milliseconds(cases: Mapping[str, Callable[[int], Any]], rounds: int, warmup: int = 1) -> dict[str, float]:
+    """Of every case (name -> function of the round's number), over the rounds after those of warmup. Cases take turns,
+    so that a machine whose speed drifts is fair to all of them."""
+    seconds: dict[str, list[float]] = {name: [] for name in cases}
+    with Progress(warmup + rounds, "timing") as progress:
+        for number in range(warmup + rounds):
+            for name, case in cases.items():
+                start = time.perf_counter()
+                case(number)
+                seconds[name].append(time.perf_counter() - start)
+            progress.update(number + 1)
+    return {name: 1e3 * statistics.median(values[warmup:]) for name, values in seconds.items()}
 
 
 def _read_proc(file: str, key: str) -> str | None:
