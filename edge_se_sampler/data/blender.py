@@ -60,11 +60,9 @@ def has_split(folder: Path, split: str) -> bool:
 
 
 def read_blender(folder: Path, split: Split) -> Views:
-    """Read one split of a scene; files that no frame lists are ignored.
-
-    Poses are returned as written (not moved, scaled or orthonormalized). A frame without mask_path is trained on as a
-    whole. InputError for anything that cannot be used: first of the folder, then of the json, then of the images.
-    """
+    """Read one split of a scene; files that no frame lists are ignored. Poses are returned as written (not moved,
+    scaled or orthonormalized). A frame without mask_path is trained on as a whole. InputError for anything that cannot
+    be used: first of the folder, then of the json, then of the images."""
     folder = Path(folder)
     _check_folder(folder, split)
     top = read_json(transforms_path(folder, split))
@@ -76,7 +74,10 @@ def read_blender(folder: Path, split: Split) -> Views:
     shared = _read_intrinsics(top)
     frames = [_read_frame(entry, shared, folder) for entry in entries]
     half_tan = _read_half_tan(top, frames)
-    _check_distinct([frame.image for frame in frames])
+    first: dict[Path, SourceFile] = {}
+    for file in (frame.image for frame in frames):
+        if (other := first.setdefault(file.path, file)) is not file:
+            raise file.error(f"is already the image of {other.location.field}", "list every image once")
     with ThreadPoolExecutor() as pool:  # decoding releases Python's lock
         images = tuple(pool.map(read_image, [frame.image for frame in frames]))
         _check_sizes(frames, images)
@@ -101,7 +102,7 @@ def _check_folder(folder: Path, split: str) -> None:
     found = ", ".join(transforms_path(folder, other).name for other in SPLITS if has_split(folder, other))
     others = f"only {found}" if found else "nor that of any other split"
     hint = "a Blender scene has transforms_train.json and, for other splits, transforms_val.json, transforms_test.json"
-    raise location.error(f"has no {transforms_path(folder, split).name}, {others}", hint)
+    raise location.error(f"has no transforms_{split}.json, {others}", hint)
 
 
 def _read_frame(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) -> _Frame:
@@ -169,14 +170,6 @@ def _locate(name: JsonValue, folder: Path) -> SourceFile:
     if not file.path.is_relative_to(os.path.realpath(folder)):
         raise file.error("leads out of the folder", "put the file into the folder")
     return file
-
-
-def _check_distinct(files: Sequence[SourceFile]) -> None:
-    first: dict[Path, SourceFile] = {}
-    for file in files:
-        other = first.setdefault(file.path, file)
-        if other is not file:
-            raise file.error(f"is already the image of {other.location.field}", "list every image once")
 
 
 def _check_sizes(frames: Sequence[_Frame], images: Sequence[np.ndarray]) -> None:

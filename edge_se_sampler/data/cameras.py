@@ -96,11 +96,9 @@ class Cameras:
         return self.pixel_rays(torch.cartesian_prod(torch.tensor([camera]), torch.arange(height), torch.arange(width)))
 
     def project(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Where one camera sees points (m, 3) in world units: the inverse of `generate_rays`.
-
-        Returns coords (m, 2), y, x in pixels, which mean nothing behind the camera, and the depth (m,) along the
-        optical axis in world units, positive in front of the camera.
-        """
+        """Where one camera sees points (m, 3) in world units: the inverse of `generate_rays`. Returns coords (m, 2),
+        y, x in pixels, which mean nothing behind the camera, and the depth (m,) along the optical axis in world units,
+        positive in front of the camera."""
         pose = self.camera_to_worlds[camera]
         right, up, back = pose[:, :3].T @ (points - pose[:, 3]).T
         depth = -back
@@ -109,11 +107,8 @@ class Cameras:
         return torch.stack((y, x), dim=1), depth
 
     def interpolate(self, first: int, second: int, fraction: float) -> Cameras:
-        """One camera at a fraction, in [0, 1], of the way between two, with the first one's intrinsics and size.
-
-        It rotates at an even rate, and the world's origin moves evenly in its view: between cameras that look at one
-        point it looks there too.
-        """
+        """One camera at a fraction, in [0, 1], of the way between two, with the first one's intrinsics and size. It
+        rotates at an even rate, and the world's origin moves evenly in its view."""
         a, b = self.camera_to_worlds[first].double(), self.camera_to_worlds[second].double()
         rotation = a[:, :3] @ rotation_power(a[:, :3].T @ b[:, :3], fraction)
         origin_in_camera = torch.lerp(a[:, :3].T @ a[:, 3], b[:, :3].T @ b[:, 3], fraction)

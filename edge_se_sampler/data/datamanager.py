@@ -108,11 +108,9 @@ def unit_interval(image: Tensor) -> Tensor:
 
 
 def image_batch(views: Views) -> dict[str, Any]:
-    """All views in nerfstudio's format; InputError if there are none.
-
-    "image" (n, H, W, 3|4) uint8, "mask" (n, H, W, 1) bool if there are any, "image_idx" (n,) int64; lists of n images
-    and masks where sizes differ. Among RGBA images RGB ones get opaque alpha.
-    """
+    """All views in nerfstudio's format; InputError if there are none: "image" (n, H, W, 3|4) uint8, "mask" (n, H, W, 1)
+    bool if there are any, "image_idx" (n,) int64; lists of n images and masks where sizes differ. Among RGBA images
+    RGB ones get opaque alpha."""
     if not views.images:
         raise InputError("there are no training views; transforms_train.json must list at least one frame")
     channels = max(image.shape[2] for image in views.images)

@@ -20,11 +20,9 @@ _MODES = {"1": "RGB", "L": "RGB", "P": "RGB", "RGB": "RGB", "LA": "RGBA", "PA": 
 
 
 def read_image(file: SourceFile) -> np.ndarray:
-    """The stored pixels, (H, W, 3|4) uint8, straight alpha: no gamma, no EXIF rotation.
-
-    Gray becomes RGB, a palette its colors, transparency of any kind an alpha channel. InputError for a file that is
-    neither PNG nor JPEG, damaged, of 16 bits, of no pixels, or of colors other than gray and RGB.
-    """
+    """The stored pixels, (H, W, 3|4) uint8, straight alpha: no gamma, no EXIF rotation. Gray becomes RGB, a palette its
+    colors, transparency of any kind an alpha channel. InputError for a file that is neither PNG nor JPEG, damaged, of
+    16 bits, of no pixels, or of colors other than gray and RGB."""
     data = file.read_bytes()
     if not data.startswith((_PNG, _JPEG)):
         raise file.error("is not a PNG or JPEG image", "save the image as 8-bit PNG or JPEG")

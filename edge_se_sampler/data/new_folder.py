@@ -15,10 +15,8 @@ from edge_se_sampler.errors import InputError
 @contextmanager
 def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
     """A temporary folder inside `out` in which to write workspace/<name> of every target; at the end they are moved.
-
     On any exception nothing is left behind. InputError if a target is there and not empty, `out` cannot be written, or
-    the disk is full; OSError if a target was empty and no longer is.
-    """
+    the disk is full; OSError if a target was empty and no longer is."""
     _check_not_taken(out, targets)
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:

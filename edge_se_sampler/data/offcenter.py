@@ -73,10 +73,6 @@ class Canvas:
         canvas[rows.start + y : rows.stop + y, columns.start + x : columns.stop + x] = image[rows, columns]
         return canvas
 
-    def count_cut_off(self, foreground: np.ndarray) -> int:
-        """How many pixels of (H, W) bool `foreground` the shifted copy would cut off."""
-        return int(np.count_nonzero(foreground) - np.count_nonzero(foreground[self.visible(self.corners["shifted"])]))
-
     def min_pad(self, foreground: np.ndarray) -> np.ndarray:
         """(2,) fractions of W and H: the least padding with which the shifted copy keeps (H, W) bool `foreground`."""
         positions = np.argwhere(foreground)[:, ::-1] + self.shift
@@ -158,7 +154,8 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
             foreground = image[..., 3] > 0 if image.shape[2] == 4 else np.any(image != background, axis=-1)
             canvas = Canvas.of(image, shift, pad)
             needed = np.maximum(needed, canvas.min_pad(foreground))
-            if count := canvas.count_cut_off(foreground):
+            kept = foreground[canvas.visible(canvas.corners["shifted"])]
+            if count := np.count_nonzero(foreground) - np.count_nonzero(kept):
                 cut_off.append((frame, count))
     if cut_off:
         frame, count = cut_off[0]

@@ -63,8 +63,7 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
 
 
 def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
-    """Continue an interrupted run under its own settings (`run.config`), but for max_seconds.
-    InputError if its checkpoint is bad, or its data is gone or has changed."""
+    """Continue an interrupted run under its own settings, but for max_seconds; InputError for a bad run or data."""
     config = replace(config, max_seconds=max_seconds)
     config.check()
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
@@ -123,7 +122,7 @@ def select_views(config: TrainerConfig, count: int) -> list[int] | None:
 
 
 def describe_run(trainer: Trainer) -> str:
-    """Where a run is written, its model, its length and its sampling, in four lines at most."""
+    """Where a run is written, its model, its length and its sampling."""
     config, manager = trainer.config, trainer.pipeline.datamanager.config
     model, sampler = config.pipeline.model, manager.pixel_sampler
     samples = "samples in occupied cells"

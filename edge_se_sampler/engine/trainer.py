@@ -110,11 +110,11 @@ class Trainer:
         value = float(loss)
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
-        if self.dead_network_reset is not None:
-            for network, sub_seed in self.dead_network_reset.after_backward().items():
-                message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
-                tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
-                self._record(step, reinitialized=network, sub_seed=sub_seed)
+        reinitialized = {} if self.dead_network_reset is None else self.dead_network_reset.after_backward()
+        for network, sub_seed in reinitialized.items():
+            message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
+            tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
+            self._record(step, reinitialized=network, sub_seed=sub_seed)
         for weight, state in self.optimizer.state.items():
             if state["exp_avg"].shape != weight.shape:  # a feature table that was resized
                 state.clear()

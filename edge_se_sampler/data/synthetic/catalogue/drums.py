@@ -17,7 +17,6 @@ BLACK = Material((0.03, 0.03, 0.03))
 STICK = Material((0.6, 0.4, 0.2))
 
 FLOOR = -0.8
-UPRIGHT = rotation((0, 0, 1), 0)
 
 
 def drums(scene: SceneBuilder) -> None:
@@ -25,7 +24,7 @@ def drums(scene: SceneBuilder) -> None:
     _drum(scene, (-0.25, 0.05, 0.28), 0.2, 0.13, rotation((1, 0.2, 0), 18))
     _drum(scene, (0.25, 0.05, 0.28), 0.21, 0.13, rotation((1, -0.2, 0), 18))
     _drum(scene, (-0.72, -0.35, -0.12), 0.24, 0.1, rotation((1, 0, 0), 6))
-    _drum(scene, (0.74, -0.3, -0.25), 0.3, 0.26, UPRIGHT)
+    _drum(scene, (0.74, -0.3, -0.25), 0.3, 0.26, rotation((0, 0, 1), 0))
     for x in (-0.9, -0.74, -0.56):
         scene.tube((x, -0.35 + 0.1 * (x + 0.7), -0.22), (1.05 * x, -0.4, FLOOR), 0.012, CHROME)
     for x, y in ((0.55, -0.45), (0.95, -0.3), (0.7, -0.05)):
