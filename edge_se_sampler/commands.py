@@ -173,7 +173,7 @@ class Show:
     seed: int = 0
     """Seed of the drawn pixels."""
     pixel_sampler: EdgeSEPixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
-    """Settings of the sampler."""
+    """Settings of the distribution and the batch; those of phases and errors have no effect here."""
 
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender

@@ -11,7 +11,7 @@ import pytest
 from tiny import SMALL
 
 from edge_se_sampler.cli import main
-from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 
 
 @pytest.fixture(scope="session")

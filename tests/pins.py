@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from batches import LATE, MIXED, SAME, batch_of, following, half_masks
 
-from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder

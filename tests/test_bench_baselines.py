@@ -14,7 +14,7 @@ from edge_se_sampler.bench.baselines import run as run_module
 from edge_se_sampler.bench.baselines.results import BaselineSettings, read_baselines
 from edge_se_sampler.bench.baselines.run import Clock, TimeIsUp, mean_psnr, train
 from edge_se_sampler.bench.chart.trials import ChartSettings
-from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.errors import InputError
 
 NERF_PYTORCH = """

@@ -19,7 +19,7 @@ from edge_se_sampler.bench.chart.trials import ChartSettings, Trial, config_of, 
 from edge_se_sampler.bench.chart.variants import VARIANTS
 from edge_se_sampler.bench.runner import run_in_subprocess, write_result
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.methods import method_configs
 

@@ -225,7 +225,7 @@ def test_the_command_trains_and_reports_a_small_sweep(
     flags = ["--settings", "base", "off centre", "--strategies", "vanilla-nerf", "adaptive", "--seeds", 0]
     answer = edge_se("bench", "stability", "--output-dir", out, "--workplace", tmp_path / "w", *flags)
     assert answer.code == 0, answer
-    assert {path.name for path in out.iterdir()} == {"result.json", "README.md", "failure-rates.png", "over-time.png"}
+    assert {path.name for path in out.iterdir()} == {"result.json", "README.md", "failure-rates.png"}
     runs = json.loads((out / "result.json").read_text())["runs"]
     assert [(run["setting"], run["strategy"]) for run in runs] == [
         ("base", "adaptive"), ("base", "vanilla-nerf"), ("off centre", "adaptive"), ("off centre", "vanilla-nerf"),

@@ -11,10 +11,10 @@ import torch
 
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.cameras import Cameras, RayBundle
-from edge_se_sampler.data.synthetic import make_scenes
 from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.data.synthetic.visibility import NOTHING, nearest_hits
-from edge_se_sampler.models.ray_samples import stratified
+from edge_se_sampler.models.rendering import stratified
 
 SIZES = [(5, 7), (4, 6), (3, 8)]  # rows, columns
 

@@ -15,7 +15,7 @@ from edge_se_sampler.bench.chart.summary import mean_psnr_at
 from edge_se_sampler.bench.chart.variants import VARIANTS
 from edge_se_sampler.bench.demo import train as demo
 from edge_se_sampler.bench.paper.published import SCENES
-from edge_se_sampler.bench.scenes import cached_scene
+from edge_se_sampler.bench.train import cached_scene
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

@@ -17,7 +17,7 @@ from test_cli_bad_input import refused
 
 from edge_se_sampler.data.blender import SPLITS, Split, read_blender
 from edge_se_sampler.data.offcenter import offcenter
-from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.errors import InputError
 

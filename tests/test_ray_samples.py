@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from edge_se_sampler.models.ray_samples import importance, stratified
+from edge_se_sampler.models.rendering import importance, stratified
 
 COUNT = 200_000
 ALPHA = 1e-6

@@ -15,7 +15,7 @@ import pytest
 import torch
 from tiny import resume_trainer, tiny_config, tiny_trainer, tiny_views
 
-from edge_se_sampler.bench.overrides import override
+from edge_se_sampler.bench.train import override
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling import schedule

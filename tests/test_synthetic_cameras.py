@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import DISTANCE, Placement, Split, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
+from edge_se_sampler.data.synthetic.catalogue import SCENE_NAMES, synthetic_scene
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.data.synthetic.scene import Material, SceneBuilder
 

@@ -16,8 +16,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.synthetic import ANALOG_OF, Camera, make_scenes, render, synthetic_scene
-from edge_se_sampler.data.synthetic.cameras import FIELD_OF_VIEW, Placement, Split, framing, poses
+from edge_se_sampler.data.synthetic.cameras import FIELD_OF_VIEW, Camera, Placement, Split, framing, poses
+from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, synthetic_scene
+from edge_se_sampler.data.synthetic.folder import make_scenes
+from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
@@ -199,7 +201,7 @@ def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         "from pathlib import Path\n"
-        "from edge_se_sampler.data.synthetic import make_scenes\n"
+        "from edge_se_sampler.data.synthetic.folder import make_scenes\n"
         "if __name__ == '__main__':\n"
         "    try:\n"
         f"        make_scenes(Path({str(tmp_path / 'out')!r}), ['mic', 'ficus'], num_train=500,\n"

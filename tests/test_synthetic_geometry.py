@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import DISTANCE, Camera, framing, poses
-from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
+from edge_se_sampler.data.synthetic.catalogue import SCENE_NAMES, synthetic_scene
 from edge_se_sampler.data.synthetic.linear import invert, rotation, unit
 from edge_se_sampler.data.synthetic.render import SAMPLES_PER_AXIS, render
 from edge_se_sampler.data.synthetic.scene import BALL_RADIUS, Material, Scene, SceneBuilder

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_se_sampler.data.synthetic import SCENE_NAMES
 from edge_se_sampler.data.synthetic.cameras import framing, poses
-from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
+from edge_se_sampler.data.synthetic.catalogue import SCENE_NAMES, synthetic_scene
 from edge_se_sampler.data.synthetic.linear import unit
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.data.synthetic.shading import radiance

@@ -35,10 +35,7 @@ def report_of(folder: Path) -> Any:
 
 def write_report(folder: Path, readme: Path | None = None, workplace: Path | None = None) -> None:
     """Write a folder's pictures (of renderings in the workplace) and README.md, and fill its tables into another text.
-
-    Raises:
-        InputError: no result lies there, matplotlib is missing, or a file cannot be written.
-    """
+    InputError: no result lies there, matplotlib is missing, or a file cannot be written."""
     report = report_of(folder)
     if hasattr(report, "draw"):
         report.draw(folder, workplace)

@@ -1,32 +1,60 @@
-"""One training of an experiment, and what is measured of it."""
+"""A training of an experiment: its config, its scene, and what is measured of it."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import time
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.files import write_image
+from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 
+Config = TypeVar("Config")
+
+SAMPLER = "pipeline.datamanager.pixel_sampler"
+MANAGER = "pipeline.datamanager"
+MODEL = "pipeline.model"
+
+
+def override(config: Config, changes: Mapping[str, Any]) -> Config:
+    """The config with the fields at dotted paths replaced, e.g. {"pipeline.model.width": 64}."""
+    for path, value in changes.items():
+        name, _, rest = path.partition(".")
+        new = override(getattr(config, name), {rest: value}) if rest else value
+        config = replace(config, **{name: new})  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return config
+
+
+def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
+    """The Blender folder of one of the seven synthetic scenes in workplace/scenes, rendered if it is not there. Options are
+    those of `make_scenes`, whose errors it raises; scenes of other options lie in other folders."""
+    words = [f"{key}-{value}" for key, value in sorted(options.items())]
+    folder = workplace / "scenes" / ("_".join(words) or "default")
+    if not (folder / name).exists():
+        with Progress(0, f"rendering {name}") as progress:
+            make_scenes(folder, [name], progress=progress.update, **options)
+    return folder / name
+
 
 def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> Run:
-    """Train a config on one thread, and measure it on its test views.
-
-    Args:
-        view_path: a PNG to write, the first test view as the trained network renders it.
+    """Train a config on one thread, and measure it on its test views; the first one's rendering goes to view_path, a PNG.
 
     Returns:
         the measures of `evaluate` and of `measure_outcome`; which networks were dead before the first step, and how

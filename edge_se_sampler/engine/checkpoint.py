@@ -19,6 +19,7 @@ from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 MAGIC = b"edge-se-checkpoint 2 "
+NAMES = f"step-{9 * '[0-9]'}*.ckpt"
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
@@ -28,7 +29,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
     payload = buffer.getvalue()
     path = folder / f"step-{step:09d}.ckpt"
     write_atomically(path, MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
-    for other in folder.glob("step-*.ckpt"):
+    for other in folder.glob(NAMES):
         if _step_of(other) < step:
             other.unlink(missing_ok=True)
     return path
@@ -36,7 +37,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
 
 def latest_checkpoint(folder: Path) -> Path:
     """The checkpoint with the highest step; InputError if there is none."""
-    latest = max(folder.glob("step-*.ckpt"), key=_step_of, default=None)
+    latest = max(folder.glob(NAMES), key=_step_of, default=None)
     if latest is None:
         raise InputError(f"{folder}: no checkpoint (step-*.ckpt); the run ended before its first was saved")
     return latest

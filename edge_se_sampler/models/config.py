@@ -76,7 +76,7 @@ class ModelConfig(InstantiateConfig):
     empty_space_skipping: bool = False
     """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
     voxel_size_px: float = 1.0
-    """Size of such a cell, in footprints of a pixel at the center of the scene; larger where there would be more cells
+    """Size of a grid cell, in footprints of a pixel at the center of the scene; larger where there would be more cells
     than are worth their memory."""
 
     @property
@@ -149,7 +149,7 @@ class LeanModelConfig(ModelConfig):
     presets: ClassVar[Mapping[str, SizePreset]] = LEAN_PRESETS
 
     empty_space_skipping: bool = True
-    """Whether cells are culled as the next two say; off: all of the box is sampled."""
+    """Sample only cells that may hold something, by cull-by-alpha and cull-by-density; off: all of the box."""
     cull_by_alpha: bool = True
     """Leave out what lies outside the visual hull of the alpha masks."""
     cull_by_density: bool = True

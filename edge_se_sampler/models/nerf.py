@@ -10,8 +10,7 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.field import NeRFField
 from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.models.ray_samples import importance, stratified
-from edge_se_sampler.models.rendering import composite, intervals, sample_weights
+from edge_se_sampler.models.rendering import composite, importance, intervals, sample_weights, stratified
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 
 POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}

@@ -46,11 +46,8 @@ def planned_steps(trainer: Any) -> int:
 
 
 def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
-    """Load the state that the schedule had at the loaded checkpoint, if there is one.
-
-    Raises:
-        InputError: the file beside the loaded checkpoint's folder holds no such state.
-    """
+    """Load the state that the schedule had at the loaded checkpoint, if there is one. InputError: the file beside the
+    loaded checkpoint's folder holds no such state."""
     loaded = _loaded_run(trainer)
     if not loaded or not (path := loaded / SCHEDULE_FILE).exists():
         return

@@ -60,8 +60,11 @@ def analyze_scene(
     silhouettes = find_silhouettes(views) if by_alpha else {}
     hull = _bounded_hull(views, silhouettes, box, cell_size, MAX_OCCUPIED_CELLS if silhouettes else max_uncarved)
     if silhouettes and (hull is None or _missed_fraction(views, silhouettes, hull) > MAX_MISSED_FRACTION):
-        problem = "do not agree on where the object is, or show too little of it: they carve nothing away"
-        print(f"the views' alpha masks {problem}", file=sys.stderr)
+        print(
+            f"the views' alpha masks carve nothing away: the object does not lie between near {near:g} and far "
+            f"{far:g} (set both), or they do not agree on where it is, or show too little of it",
+            file=sys.stderr,
+        )
         silhouettes, hull = {}, _bounded_hull(views, {}, box, cell_size, max_uncarved)
     if hull is None:
         raise InputError(

@@ -23,11 +23,8 @@ CANNY_THRESHOLDS = (100, 200)
 
 
 def unit_float(image: np.ndarray) -> np.ndarray:
-    """The image as float32 in [0, 1]; uint8 is divided by 255.
-
-    Raises:
-        ValueError: not (H, W, 3|4), neither uint8 nor float, or a value that is not in [0, 1].
-    """
+    """The image as float32 in [0, 1]; uint8 is divided by 255. ValueError: not (H, W, 3|4), neither uint8 nor float, or
+    a value that is not in [0, 1]."""
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise ValueError(f"an image must be (H, W, 3) or (H, W, 4), not {image.shape}")
     if image.dtype == np.uint8:

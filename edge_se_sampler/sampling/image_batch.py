@@ -30,12 +30,8 @@ class ImageBatch:
     def of(
         cls, image_batch: dict[str, Any], *, use_mask: bool, background_color: tuple[float, float, float] = WHITE
     ) -> ImageBatch:
-        """Read a host's batch, see the protocol's `PixelSampler.sample`.
-
-        Raises:
-            ValueError: a key that is neither stacked (k, H, W, ...) nor a list of k (H, W, ...), or another number
-                of image numbers.
-        """
+        """Read a host's batch, see the protocol's `PixelSampler.sample`. ValueError: a key that is neither stacked (k,
+        H, W, ...) nor a list of k (H, W, ...), or another number of image numbers."""
         per_pixel = {key: value for key, value in image_batch.items() if key != "image_idx" and value is not None}
         sizes = _sizes(image_batch["image"])
         if len(image_batch["image_idx"]) != len(sizes):

@@ -115,11 +115,8 @@ class Distribution(SamplerPart, ABC):
         self._table, self._table_index = PixelTable(), dict[int, int]()
 
     def tables(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor]:
-        """What is drawn from, and the index of each image of the batch in it, (k,) int64.
-
-        Raises:
-            InputError: an image has no strengths.
-        """
+        """What is drawn from, and the index of each image of the batch in it, (k,) int64. InputError: an image has no
+        strengths."""
         numbers = batch.numbers.tolist()
         new = [k for k, number in enumerate(numbers) if number not in self._table_index]
         if new:
@@ -141,11 +138,8 @@ class Distribution(SamplerPart, ABC):
 
     def drawable(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
         """What `tables` returns, and the positions of images with a pixel to draw, by ascending image number: hosts
-        collate images in any order, and a draw should not depend on it.
-
-        Raises:
-            InputError: there is no pixel to draw, or an image has no strengths.
-        """
+        collate images in any order, and a draw should not depend on it. InputError: there is no pixel to draw, or an
+        image has no strengths."""
         source, table_index = self.tables(batch)
         drawable = torch.nonzero(source.drawable(table_index))[:, 0]
         drawable = drawable[torch.argsort(batch.numbers.cpu()[drawable])]

@@ -118,11 +118,8 @@ class Strategy(NamedTuple):
 
 
 def build_strategies(settings: SamplingSettings) -> dict[str, Strategy]:
-    """The early and the late strategy, and the uniform one, by their names; uniform tables are shared.
-
-    Raises:
-        InputError: an unknown name.
-    """
+    """The early and the late strategy, and the uniform one, by their names; uniform tables are shared. InputError: an
+    unknown name."""
     uniform = Uniform(settings)
     strategies = {Uniform.name: Strategy(uniform, Selector(settings))}
     for name in (settings.early, settings.late):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edge_se_sampler.data.synthetic import make_scenes
+from edge_se_sampler.data.synthetic.folder import make_scenes
 
 
 @pytest.fixture(scope="session")

@@ -31,11 +31,8 @@ class BenchBaselines(ChartOptions):
     """What distinguishes these flags from others, in pictures and tables."""
 
     def run(self) -> None:
-        """Train one after the other; what has ended is kept.
-
-        Raises:
-            InputError: the program is not there, refuses its flags or ends too soon, or the json is of other settings.
-        """
+        """Train one after the other; what has ended is kept. InputError: the program is not there, refuses its flags or
+        ends too soon, or the json is of other settings."""
         from edge_se_sampler.bench.baselines.results import BaselineSettings
         from edge_se_sampler.bench.baselines.run import train, version_of
         from edge_se_sampler.bench.runner import load_or_create, run_in_subprocess, write_result

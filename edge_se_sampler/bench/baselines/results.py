@@ -30,11 +30,8 @@ class BaselineSettings(ChartSettings):
 
 
 def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str, Any]]:
-    """Name and version -> result of the baselines in a chart's folder, in the order of their file names.
-
-    Raises:
-        InputError: a file cannot be read, lacks something, or is of another number of threads or size of images.
-    """
+    """Name and version -> result of the baselines in a chart's folder, in the order of their file names. InputError: a
+    file cannot be read, lacks something, or is of another number of threads or size of images."""
     baselines = {}
     for path in sorted((folder / "baselines").glob("*.json")):
         result = read_result(path)

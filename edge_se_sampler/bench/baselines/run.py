@@ -72,10 +72,7 @@ class Clock:
 
 def train(settings: BaselineSettings, checkout: Path | None, data: Path, seed: int) -> Run:
     """Steps and curve of a training; to be called in a fresh process, because programs change what is global.
-
-    Raises:
-        InputError: the program is not there, refuses its flags or ends too soon.
-    """
+    InputError: the program is not there, refuses its flags or ends too soon."""
     torch.set_num_threads(settings.threads)
     clock = Clock(settings)
     if checkout is not None:

@@ -53,7 +53,7 @@ class ChartOptions:
         return ChartSettings(self.seconds, self.threads, sizes[self.scenes[0]])
 
     def scene_folder(self, scene: str) -> Path:
-        from edge_se_sampler.bench.scenes import cached_scene
+        from edge_se_sampler.bench.train import cached_scene
 
         return cached_scene(self.workplace, scene) if self.data is None else self.data / scene
 

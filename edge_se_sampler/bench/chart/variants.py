@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER
 from edge_se_sampler.bench.paper.published import LABELS
+from edge_se_sampler.bench.train import MANAGER, MODEL, SAMPLER
 
 RECOMMENDED = "lean"
 """Every group is compared with this variant."""

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.overrides import override
 from edge_se_sampler.bench.runner import new_result
-from edge_se_sampler.bench.scenes import cached_scene
+from edge_se_sampler.bench.train import cached_scene, override
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_axes
@@ -29,11 +28,7 @@ METHODS = {"vanilla-nerf": "Random", "edge-se-nerf": "Edge + SE"}
 
 def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     """Render the scene, train both methods, and leave demo.png and demo.json in output_dir, scene and runs in demo/;
-    the content of demo.json is returned.
-
-    Raises:
-        InputError: output_dir cannot be written, or matplotlib is missing.
-    """
+    the content of demo.json is returned. InputError: output_dir cannot be written, or matplotlib is missing."""
     require_pyplot()
     make_folder(output_dir, "--output-dir")
     start = time.monotonic()

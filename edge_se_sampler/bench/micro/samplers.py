@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.machine import median_milliseconds, resident_memory
-from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.bench.runner import run_in_subprocess
+from edge_se_sampler.bench.train import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.pipeline import Pipeline

@@ -38,11 +38,7 @@ class BenchNerfstudio(ExperimentCommand):
         return Experiment("nerfstudio", settings, lambda _: trials, run_trial, arguments)
 
     def run(self) -> None:
-        """Train, measure costs unless the result has them, and report.
-
-        Raises:
-            InputError: as the base class.
-        """
+        """Train, measure costs unless the result has them, and report. InputError: as the base class."""
         from edge_se_sampler.bench.nerfstudio.train import measure_costs, render_scene
         from edge_se_sampler.bench.report import write_report
         from edge_se_sampler.bench.runner import read_result, write_result

@@ -21,7 +21,7 @@ from edge_se_sampler.bench.machine import median_milliseconds, resident_memory
 from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import run_in_subprocess
-from edge_se_sampler.bench.scenes import cached_scene
+from edge_se_sampler.bench.train import cached_scene
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures

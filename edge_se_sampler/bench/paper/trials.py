@@ -8,14 +8,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from edge_se_sampler.bench.overrides import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.bench.paper.published import LABELS, SCENES
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.scenes import cached_scene
-from edge_se_sampler.bench.train import train_and_measure
+from edge_se_sampler.bench.train import MANAGER, MODEL, SAMPLER, cached_scene, override, train_and_measure
 from edge_se_sampler.data.blender import has_split, read_blender
 from edge_se_sampler.data.offcenter import offcenter
-from edge_se_sampler.data.synthetic import ANALOG_OF
+from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
 from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
 from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.progress import Progress

@@ -13,11 +13,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from edge_se_sampler.bench.overrides import SAMPLER, override
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.train import train_and_measure
+from edge_se_sampler.bench.train import SAMPLER, override, train_and_measure
 from edge_se_sampler.engine.config import TrainerConfig
 
 SHARES = ("0.02", "0.05", "0.1", "0.2", "0.5")

@@ -15,7 +15,7 @@ from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
 from edge_se_sampler.bench.tables import describe_command, markdown_table
-from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_axes
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
 
 FAILURE_MODES = {
     "dead at the start": "dead", "emptied": "emptied", "opaque background": "opaque", "underfit": "underfit",
@@ -48,7 +48,6 @@ def draw(folder: Path, workplace: Path | None) -> None:
     runs = read_result(folder / "result.json")["runs"]
     if runs:
         save_figure(draw_failure_rates(count_failure_modes(runs)), folder / "failure-rates.png")
-        save_figure(draw_over_time(runs), folder / "over-time.png")
 
 
 def count_failure_modes(runs: Sequence[Run]) -> dict[str, dict[str, Modes]]:
@@ -121,20 +120,5 @@ def draw_failure_rates(counts: dict[str, dict[str, Modes]]) -> Any:
     axis.set_yticks(range(len(counts)), list(counts), fontsize=8)
     axis.tick_params(length=0)
     axis.set_xlabel("failed trainings; each setting differs from the base in what is named", fontsize=9)
-    figure.tight_layout()
-    return figure
-
-
-def draw_over_time(runs: Sequence[Run]) -> Any:
-    """Share of all trainings of a strategy that show something of the object, over the iterations."""
-    figure, axis = require_pyplot().subplots(figsize=(8.0, 4.2))
-    for strategy, method in STRATEGIES.items():
-        shares = np.array([run["shares"] for run in runs if run["strategy"] == strategy])
-        if len(shares):
-            alive = 100 * (shares <= COLLAPSED_SHARE).mean(axis=0)
-            axis.plot(100 * np.arange(1, len(alive) + 1) / len(alive), alive, label=method.label)
-    axis.set(xlabel="% of the iterations", ylabel="% of trainings that show the object", xlim=(0, 100), ylim=(0, 102))
-    style_axes(axis)
-    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
     figure.tight_layout()
     return figure

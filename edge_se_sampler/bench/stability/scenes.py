@@ -12,8 +12,9 @@ from torch import Tensor
 
 from edge_se_sampler.bench.stability.settings import Background
 from edge_se_sampler.data.cameras import Cameras, RayBundle
-from edge_se_sampler.data.synthetic import Camera, render, synthetic_scene
-from edge_se_sampler.data.synthetic.cameras import Split, poses
+from edge_se_sampler.data.synthetic.cameras import Camera, Split, poses
+from edge_se_sampler.data.synthetic.catalogue import synthetic_scene
+from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.data.views import Views
 
 SCENE = "materials"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from edge_se_sampler.bench.overrides import SAMPLER
 from edge_se_sampler.bench.paper.published import LABELS
+from edge_se_sampler.bench.train import SAMPLER
 
 Background = Literal["white", "black", "grey", "green", "random", "textured"]
 
