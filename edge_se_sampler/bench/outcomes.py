@@ -37,9 +37,11 @@ def failed(run: dict[str, Any]) -> bool:
 
 
 def measure_outcome(results: dict[str, Any], pictures: list[Picture], color: float) -> dict[str, Any]:
-    """Compare a training, by its `evaluate` on pictures, with a plain grey background (0 black, 1 white): background_psnr;
-    foreground_share, the error on the object as a share of the background's there, a mean over views; outcome.
-    InputError if no view tells the object from the background."""
+    """Compare a training, by its `evaluate` on pictures, with a plain grey background (0 black, 1 white).
+
+    Returns its outcome, background_psnr, and foreground_share: the error on the object as a share of the background's
+    there, a mean over views. InputError if no view tells the object from the background.
+    """
     background = [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
     key = "foreground_psnr"
     views = zip(results["images"], background, strict=True)

@@ -43,8 +43,8 @@ def override(config: Config, changes: Mapping[str, Any]) -> Config:
 
 
 def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
-    """The Blender folder of one of the seven synthetic scenes in workplace/scenes, rendered if it is not there. Options are
-    those of `make_scenes`, whose errors it raises; scenes of other options lie in other folders."""
+    """The Blender folder of a synthetic scene in workplace/scenes, rendered if it is not there. Options are those of
+    `make_scenes`, whose errors it raises; scenes of other options lie in other folders."""
     words = [f"{key}-{value}" for key, value in sorted(options.items())]
     folder = workplace / "scenes" / ("_".join(words) or "default")
     if not (folder / name).exists():
@@ -54,7 +54,7 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
 
 
 def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> Run:
-    """Train a config on one thread, and measure it on its test views; the first one's rendering goes to view_path, a PNG.
+    """Train a config on one thread, and measure it on its test views, the first of which is written to view_path (PNG).
 
     Returns:
         the measures of `evaluate` and of `measure_outcome`; which networks were dead before the first step, and how

@@ -22,14 +22,9 @@ SCHEDULE_FILE = "edge-se-schedule.json"
 
 
 def planned_steps(trainer: Any) -> int:
-    """Iterations that the run was first planned for; also written beside this run's checkpoints, for the next to find.
-
-    Args:
-        trainer: nerfstudio's, once it has loaded its checkpoint, if there is one.
-
-    Raises:
-        InputError: the file beside the loaded checkpoint's folder is no plan, or this run's cannot be written.
-    """
+    """Iterations that the run was first planned for, of nerfstudio's trainer, once it has loaded its checkpoint; also
+    written beside this run's checkpoints, for the next to find. InputError if the loaded one's file is no plan, or this
+    run's cannot be written."""
     steps = trainer.config.max_num_iterations
     if loaded := _loaded_run(trainer):
         plan = loaded / PLAN_FILE

@@ -30,14 +30,8 @@ def ray_errors(model: Any, ray_bundle: Any, batch: dict[str, Tensor]) -> Tensor:
 
 
 def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Tensor:
-    """(n,) squared errors of rendered rays.
-
-    Args:
-        image: (n, 3|4) pixels, uint8 or in [0, 1].
-
-    Raises:
-        InputError: the outputs have neither "rgb" nor "rgb_fine".
-    """
+    """(n,) squared errors of rendered rays against (n, 3|4) pixels, uint8 or in [0, 1]. InputError if the outputs have
+    neither "rgb" nor "rgb_fine"."""
     level = "" if "rgb" in outputs else "_fine"
     if f"rgb{level}" not in outputs:
         name = type(model).__name__

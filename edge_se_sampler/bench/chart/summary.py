@@ -36,8 +36,8 @@ def moments_of(runs: list[Run]) -> list[float]:
 
 
 def psnr_at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
-    """PSNR at a moment of training by a curve's rows, [seconds, ..., PSNR], between them linear in the logarithm of time;
-    None before the first evaluation, which may come a step late."""
+    """PSNR at a moment of training, by a curve's rows [seconds, ..., PSNR]: between them linear in the logarithm of
+    time; None before the first one, which may come a step late."""
     times, psnr = [row[0] for row in curve], [row[-1] for row in curve]
     if seconds < times[0] * 0.99:
         return None
