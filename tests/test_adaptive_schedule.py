@@ -12,7 +12,8 @@ from batches import batch_of, following
 
 from edge_se_sampler.bench.paper.trials import PRESETS, synthetic_scene
 from edge_se_sampler.bench.schedule.trials import Trial, build_config
-from edge_se_sampler.bench.train import SAMPLER, override, train_and_measure
+from edge_se_sampler.bench.train import train_and_measure
+from edge_se_sampler.engine.config import SAMPLER, override
 from edge_se_sampler.sampling.background import PlainBackgrounds, summarize_errors
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels
 from edge_se_sampler.sampling.image_batch import ImageBatch

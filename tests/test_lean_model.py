@@ -14,10 +14,9 @@ import torch
 from tiny import cells, check_gradients, occupied_after, tiny_model, tiny_rays
 from torch import Tensor
 
-from edge_se_sampler.bench.train import SAMPLER, override
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
-from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.config import SAMPLER, TrainerConfig, override
 from edge_se_sampler.engine.inspection import inspect
 from edge_se_sampler.engine.pipeline import analyze_views, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import render_rays, render_view, to_pictures

@@ -10,8 +10,8 @@ import pytest
 import torch
 from tiny import resume_trainer, tiny_config, tiny_rays, tiny_trainer, tiny_views
 
-from edge_se_sampler.bench.train import override
 from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.reinitialization import PATIENCE, DeadNetworkReset, dead_networks
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import STRATEGIES, method_configs

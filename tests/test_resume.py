@@ -15,8 +15,8 @@ import pytest
 import torch
 from tiny import resume_trainer, tiny_config, tiny_trainer, tiny_views
 
-from edge_se_sampler.bench.train import override
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
+from edge_se_sampler.engine.config import override
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling import schedule
 

@@ -1,16 +1,14 @@
-"""A training of an experiment: its config, its scene, and what is measured of it."""
+"""A training of an experiment: its scene, and what is measured of it."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import time
-from collections.abc import Mapping
-from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,21 +23,6 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
-
-Config = TypeVar("Config")
-
-SAMPLER = "pipeline.datamanager.pixel_sampler"
-MANAGER = "pipeline.datamanager"
-MODEL = "pipeline.model"
-
-
-def override(config: Config, changes: Mapping[str, Any]) -> Config:
-    """The config with the fields at dotted paths replaced, e.g. {"pipeline.model.width": 64}."""
-    for path, value in changes.items():
-        name, _, rest = path.partition(".")
-        new = override(getattr(config, name), {rest: value}) if rest else value
-        config = replace(config, **{name: new})  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return config
 
 
 def cached_scene(workplace: Path, name: str, **options: Any) -> Path:

@@ -105,7 +105,6 @@ def offcenter(
     Args:
         shift: right and down positive; rounded to whole pixels, as the shifted synthetic scenes' offset is.
         pad: added on either side, rounded likewise; None: as much as the shift.
-        progress: called as progress(done, total), in views.
 
     Raises:
         InputError: bad data, a fraction out of range, an `out` that cannot be written or is not empty, an RGB

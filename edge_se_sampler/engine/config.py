@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
@@ -132,3 +133,19 @@ class MethodSpecification:
 
     config: TrainerConfig
     description: str
+
+
+Config = TypeVar("Config")
+
+SAMPLER = "pipeline.datamanager.pixel_sampler"
+MANAGER = "pipeline.datamanager"
+MODEL = "pipeline.model"
+
+
+def override(config: Config, changes: Mapping[str, Any]) -> Config:
+    """The config with the fields at dotted paths replaced, e.g. {"pipeline.model.width": 64}."""
+    for path, value in changes.items():
+        name, _, rest = path.partition(".")
+        new = override(getattr(config, name), {rest: value}) if rest else value
+        config = replace(config, **{name: new})  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return config

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge_se_sampler.bench.paper.published import LABELS
-from edge_se_sampler.bench.train import MANAGER, MODEL, SAMPLER
+from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER
 
 RECOMMENDED = "lean"
 """Every group is compared with this variant."""

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.bench.runner import new_result
-from edge_se_sampler.bench.train import cached_scene, override
+from edge_se_sampler.bench.train import cached_scene
 from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_axes
 from edge_se_sampler.engine.files import make_folder, write_json

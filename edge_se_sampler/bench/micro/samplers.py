@@ -12,9 +12,9 @@ import torch
 
 from edge_se_sampler.bench.machine import median_milliseconds, resident_memory
 from edge_se_sampler.bench.runner import run_in_subprocess
-from edge_se_sampler.bench.train import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, override
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import resolve_config

@@ -15,7 +15,8 @@ import torch
 from edge_se_sampler.bench.machine import median_milliseconds
 from edge_se_sampler.bench.micro.samplers import late_phase, training_peak
 from edge_se_sampler.bench.statistics import require_scipy_stats
-from edge_se_sampler.bench.train import cached_scene, override
+from edge_se_sampler.bench.train import cached_scene
+from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.session import prepare

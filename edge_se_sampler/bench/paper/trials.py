@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from edge_se_sampler.bench.paper.published import LABELS, SCENES
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.train import MANAGER, MODEL, SAMPLER, cached_scene, override, train_and_measure
+from edge_se_sampler.bench.train import cached_scene, train_and_measure
 from edge_se_sampler.data.blender import has_split, read_blender
 from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
-from edge_se_sampler.engine.config import MachineConfig, TrainerConfig
+from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, MachineConfig, TrainerConfig, override
 from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError

@@ -16,8 +16,8 @@ from typing import Any, Literal
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.train import SAMPLER, override, train_and_measure
-from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.bench.train import train_and_measure
+from edge_se_sampler.engine.config import SAMPLER, TrainerConfig, override
 
 SHARES = ("0.02", "0.05", "0.1", "0.2", "0.5")
 CONFIGURATIONS = (1, 2, 5, 6)

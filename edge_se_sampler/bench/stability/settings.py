@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from edge_se_sampler.bench.paper.published import LABELS
-from edge_se_sampler.bench.train import SAMPLER
+from edge_se_sampler.engine.config import SAMPLER
 
 Background = Literal["white", "black", "grey", "green", "random", "textured"]
 

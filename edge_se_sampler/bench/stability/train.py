@@ -15,7 +15,7 @@ import torch
 from edge_se_sampler.bench.outcomes import Outcome, classify
 from edge_se_sampler.bench.stability.scenes import COLORS, NUM_TRAIN, background_of, render_splits
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Setting, Trial
-from edge_se_sampler.bench.train import MANAGER, MODEL, override
+from edge_se_sampler.engine.config import MANAGER, MODEL, override
 from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
 from edge_se_sampler.engine.reinitialization import dead_networks

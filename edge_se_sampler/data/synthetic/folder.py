@@ -54,7 +54,6 @@ def make_scenes(
         placement: where the object is seen, see `framing`; for "shifted" the json states `cx` and `cy` (pixels).
         offset: of the object from the middle: right, down, as fractions of `size`.
         seed: 0 to 2**31 - 1; draws the cameras of train and val. Those of test are fixed.
-        progress: called as progress(done, total), in views.
 
     Raises:
         InputError: an unknown or repeated name, a number out of range, an offset that leaves the object fewer than 8
