@@ -25,7 +25,7 @@ class BenchReport:
     readme: Path | None = None
     """A text whose tables between `<!-- table: NAME -->` and `<!-- end -->` are filled in too."""
     workplace: Path = Path("bench")
-    """Where the experiment left renderings; pictures made of them are drawn again only if they are there."""
+    """Where the experiment left renderings; pictures of them are drawn again only if they are there."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.report import write_report

@@ -1,6 +1,6 @@
 """Settings of the pixel sampler, the same flags in every host.
 
-Not frozen, because nerfstudio's configs are not and a subclass of theirs cannot be; samplers copy it.
+Not frozen: configs of nerfstudio are not, and a subclass of an unfrozen one cannot be; samplers copy it.
 Torch-free, so that `--help` need not wait for torch.
 """
 

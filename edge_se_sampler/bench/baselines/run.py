@@ -1,7 +1,7 @@
 """Other programs, run unchanged on the chart's scenes by the chart's clock.
 
 A program is imported from a checkout of its own, or from this environment. Its training loop calls the clock after
-every step (in the place of its evaluation, which it is made to call each time, or as a callback). The clock starts when
+every step (in the place of its evaluation, which it then calls each time, or as a callback). The clock starts when
 the program begins to read the data, as it does for our trainings.
 """
 # pyright: reportMissingImports=false
