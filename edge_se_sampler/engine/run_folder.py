@@ -129,7 +129,7 @@ def config_digest(config: TrainerConfig) -> str:
 
 
 def config_from_json(default: Any, values: Any, where: str) -> Any:
-    """The config that `config_to_json` turned into these values; InputError if fields are missing, unknown or of another type."""
+    """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped."""
     fields = {field.name: field for field in dataclasses.fields(default)}
     if not isinstance(values, dict) or set(values) != set(fields):
         differing = sorted(set(values) ^ set(fields)) if isinstance(values, dict) else "not an object"
