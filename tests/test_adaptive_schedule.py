@@ -10,7 +10,7 @@ import pytest
 import torch
 from batches import batch_of, following
 
-from edge_se_sampler.bench.paper.trials import PRESETS, synthetic_scene
+from edge_se_sampler.bench.paper.trials import Settings, synthetic_scene
 from edge_se_sampler.bench.schedule.trials import Trial, build_config
 from edge_se_sampler.bench.train import train_and_measure
 from edge_se_sampler.engine.config import SAMPLER, override
@@ -310,7 +310,7 @@ def test_a_run_without_an_early_phase_dies_and_one_without_a_late_phase_is_worse
     """300 steps. Off centre a run without an early phase dies; centred, one without a late phase leaves a fog."""
 
     def trained(table: int, scene: str, **settings: Any) -> dict[str, Any]:
-        data = synthetic_scene(table, scene, PRESETS["cpu"], tmp_path)
+        data = synthetic_scene(table, scene, Settings(), tmp_path)
         config = build_config(Trial("lengths", table, scene, 300, "adaptive", 100), data, tmp_path / "runs")
         return train_and_measure(override(config, {f"{SAMPLER}.{name}": value for name, value in settings.items()}))
 

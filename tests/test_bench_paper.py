@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +14,19 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.bench import runner
+from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, published
 from edge_se_sampler.bench.paper.report import psnr_table
 from edge_se_sampler.bench.paper.trials import (
     PAPER_TABLES,
-    PRESETS,
     TABLES,
     Settings,
     Trial,
     build_config,
-    check_data,
     list_trials,
-    real_scene,
     run_trial,
     synthetic_scene,
 )
-from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.run_folder import config_from_json, config_to_json
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import InfoNeRFModelConfig
@@ -48,7 +44,7 @@ def test_the_paper_has_168_trials_a_seed() -> None:
 
 @pytest.mark.parametrize(("table", "few"), [(1, False), (2, False), (3, True), (4, True)])
 def test_a_trial_trains_its_strategy_on_its_method(table: int, few: bool, tmp_path: Path) -> None:
-    config = build_config(Trial(table, "mic", "precrop-se-nerf", 5), PRESETS["cpu"], tmp_path, tmp_path)
+    config = build_config(Trial(table, "mic", "precrop-se-nerf", 5), Settings(), tmp_path, tmp_path)
     sampler: Any = config.pipeline.datamanager.pixel_sampler
     assert (sampler.early, sampler.late) == ("precrop", "se")
     assert isinstance(config.pipeline.model, InfoNeRFModelConfig) == few
@@ -60,7 +56,7 @@ def test_a_trial_trains_its_strategy_on_its_method(table: int, few: bool, tmp_pa
 
 def test_our_tables_change_what_their_titles_say() -> None:
     def config(table: int, strategy: str) -> Any:
-        return build_config(Trial(table, "mic", strategy, 0), PRESETS["cpu"], Path("d"), Path("o"))
+        return build_config(Trial(table, "mic", strategy, 0), Settings(), Path("d"), Path("o"))
 
     assert config(5, "se-nerf").num_views == 10
     assert config(6, "se-nerf").pipeline.model == config(2, "se-nerf").pipeline.model
@@ -70,7 +66,7 @@ def test_our_tables_change_what_their_titles_say() -> None:
     assert [config(table, "vanilla-nerf").reinit_dead for table in (7, 17, 18)] == [False, True, True]
     # 5 units of work for 3 in nine tenths of the steps, 8 for 6 with unseen rays
     assert config(9, "edge-se-nerf").max_num_iterations == config(1, "edge-se-nerf").max_num_iterations / 1.6
-    assert config(12, "edge-se-nerf").max_num_iterations == round(PRESETS["cpu"].info_iterations / 1.3)
+    assert config(12, "edge-se-nerf").max_num_iterations == round(Settings().info_iterations / 1.3)
     assert {TABLES[number].placement for number in (2, 4, 6, 8, 10, 12, 15, 18)} == {"shifted"}
 
 
@@ -170,14 +166,13 @@ def test_every_scene_counts_alike_in_the_mean() -> None:
 
 
 @pytest.fixture
-def small_presets(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings of a few steps, in threads of this process."""
-    monkeypatch.setitem(PRESETS, "cpu", SMALL)
-    monkeypatch.setitem(PRESETS, "paper", replace(SMALL, image_size=None))
+    monkeypatch.setattr(paper, "Settings", lambda: SMALL)
     monkeypatch.setattr(runner, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
 
 
-@pytest.mark.usefixtures("small_presets")
+@pytest.mark.usefixtures("small_settings")
 def test_the_command_trains_a_subset_and_reports_it(tmp_path: Path, edge_se: Callable[..., Any]) -> None:
     out = tmp_path / "new" / "out"
     flags = ["--scenes", "chair", "--strategies", "vanilla-nerf", "precrop-nerf", "edge-nerf", "--seeds", 0]
@@ -200,7 +195,7 @@ def test_the_command_trains_a_subset_and_reports_it(tmp_path: Path, edge_se: Cal
     assert "(figure-2.png)" not in text  # has other scenes
 
 
-@pytest.mark.usefixtures("small_presets")
+@pytest.mark.usefixtures("small_settings")
 def test_pictures_whose_renderings_are_gone_stay_as_they_are(tmp_path: Path, edge_se: Callable[..., Any]) -> None:
     out = tmp_path / "out"
     flags = ["--tables", 1, "--scenes", "chair", "--strategies", "edge-nerf", "--seeds", 0]
@@ -214,7 +209,7 @@ def test_pictures_whose_renderings_are_gone_stay_as_they_are(tmp_path: Path, edg
     assert iio.imread(out / "sheet.png").ndim == 3
 
 
-@pytest.mark.usefixtures("small_presets")
+@pytest.mark.usefixtures("small_settings")
 def test_a_dry_run_trains_and_writes_nothing(tmp_path: Path, edge_se: Callable[..., Any]) -> None:
     answer = edge_se("bench", "paper", "--output-dir", tmp_path / "o", "--tables", 1, 4, "--dry-run")
     assert answer.code == 0, answer
@@ -223,45 +218,11 @@ def test_a_dry_run_trains_and_writes_nothing(tmp_path: Path, edge_se: Callable[.
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def real_data(tmp_path: Path) -> Path:
-    """A folder laid out as NeRF-synthetic, with one scene of 20 x 20 pixels."""
-    (scene,) = make_scenes(tmp_path / "real", ["bricks"], size=20, num_train=2, num_val=0, num_test=1)
-    scene.rename(tmp_path / "real" / "lego")
-    return tmp_path / "real"
-
-
-@pytest.mark.usefixtures("small_presets")
-def test_the_papers_preset_trains_on_real_folders(real_data: Path, tmp_path: Path, edge_se: Callable[..., Any]) -> None:
-    flags = ["--preset", "paper", "--data", real_data, "--workplace", tmp_path / "w", "--seeds", 0]
-    chosen = ["--tables", 1, 2, "--scenes", "bricks", "--strategies", "edge-nerf"]
-    answer = edge_se("bench", "paper", "--output-dir", tmp_path / "o", *flags, *chosen)
-    assert answer.code == 0, answer
-    views = tmp_path / "w" / "paper" / "views"
-    shapes = [iio.imread(views / f"{Trial(table, 'bricks', 'edge-nerf', 0).name}.png").shape for table in (1, 2)]
-    assert shapes == [(20, 20, 3), (26, 28, 3)]
-
-
-def test_padded_and_shifted_counterparts_of_real_scenes(real_data: Path, tmp_path: Path) -> None:
-    check_data(real_data, ["bricks"])
-    assert real_scene(real_data, "bricks", "centered", tmp_path) == real_data / "lego"
-    shifted, padded = (
-        read_blender(real_scene(real_data, "bricks", placement, tmp_path), "train")
-        for placement in ("shifted", "padded")
-    )
-    assert shifted.images[0].shape == padded.images[0].shape == (26, 28, 4)
-    assert [float(c[0]) for c in (shifted.cameras.cx, shifted.cameras.cy)] == [18, 16]
-    assert [float(c[0]) for c in (padded.cameras.cx, padded.cameras.cy)] == [14, 13]
-
-
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
         (("--tables", "99"), "--tables: 99 is none of 1, 2, 3, 4"),
         (("--tables", "13", "--strategies", "se-nerf"), "no chosen table has a chosen strategy"),
-        (("--preset", "paper"), "--preset paper needs --data"),
-        (("--data", "somewhere"), "--preset paper needs --data"),
-        (("--preset", "paper", "--data", "/nowhere"), "--data /nowhere: chair/transforms_train.json is missing"),
         (("--scenes", "lego"), "--scenes: 'lego'"),
         (("--strategies", "edge"), "--strategies: 'edge'"),
         (("--workers", "0"), "--workers is 0: must be at least 1"),
@@ -282,7 +243,7 @@ def test_bad_choices_are_refused(
 @pytest.mark.parametrize("trial", [Trial(1, "mic", "edge-nerf", 0), Trial(4, "mic", "vanilla-nerf", 0)])
 def test_a_committed_trial_comes_out_again(trial: Trial, tmp_path: Path) -> None:
     """On whatever machine this is: rounding grows with the steps, so the bound is what another seed would move it."""
-    settings = PRESETS["cpu"]
+    settings = Settings()
     run = run_trial(trial, settings, synthetic_scene(trial.table, trial.scene, settings, tmp_path), tmp_path)
     result = json.loads((Path(__file__).parent.parent / "configs/paper/result.json").read_text())
     (committed,) = [committed for committed in result["runs"] if asdict(trial).items() <= committed.items()]

@@ -117,7 +117,7 @@ def test_the_command_trains_in_stages_what_is_pending(
     tmp_path: Path, edge_se: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = paper.Settings("tiny", iterations=4, info_iterations=3, rays=8, image_size=16, num_train=11, num_test=1)
-    monkeypatch.setitem(paper.PRESETS, "cpu", small)
+    monkeypatch.setattr(paper, "Settings", lambda: small)
     monkeypatch.setattr(runner, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(schedule, "SCENES", ("mic",))
     monkeypatch.setattr(schedule, "CONFIGURATIONS", (2, 6))

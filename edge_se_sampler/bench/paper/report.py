@@ -34,8 +34,7 @@ def draw(folder: Path, workplace: Path | None) -> None:
 def describe(folder: Path) -> str:
     """The README.md of a folder with a result.json and pictures."""
     result = read_result(folder / "result.json")
-    settings, runs, claims = result["settings"], result["runs"], evaluate_claims(result["runs"])
-    size = "{image_size} x {image_size} pixels, {num_train} training views (or 10 of them) and {num_test} test views"
+    runs, claims = result["runs"], evaluate_claims(result["runs"])
     numbers = [number for number in TABLES if any(run["table"] == number for run in runs)]
     tables = [f"**Table {number}: {TABLES[number].title}**\n\n{psnr_table(number, runs)}" for number in numbers]
     summary = [[label, *_psnr_cells(runs, strategy, PAPER_TABLES)] for strategy, label in LABELS.items()]
@@ -44,9 +43,7 @@ def describe(folder: Path) -> str:
         __file__,
         folder,
         num_runs=len(runs),
-        scenes=f"Synthetic scenes of {size.format(**settings)}" if settings["image_size"] else "NeRF's scenes",
-        **{name: settings[name] for name in ("size", "iterations", "info_iterations", "rays")},
-        samples=" + ".join(map(str, settings["samples"] or ["the paper's number of"])),
+        **result["settings"],
         dead=sum(bool(run["dead_at_start"]) for run in runs),
         failure_rule=FAILURE_RULE,
         summary=markdown_table(["", *(table.title for table in PAPER_TABLES.values())], summary),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -11,13 +11,9 @@ from typing import Any, Literal
 from edge_se_sampler.bench.paper.published import LABELS, SCENES
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.bench.train import cached_scene, train_and_measure
-from edge_se_sampler.data.blender import has_split, read_blender
-from edge_se_sampler.data.offcenter import offcenter
-from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
+from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, MachineConfig, TrainerConfig, override
 from edge_se_sampler.engine.files import write_image
-from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.edges import unit_float
 
@@ -73,25 +69,19 @@ TABLES: dict[int, Table] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """How large the experiment is."""
+    """How large the experiment is: small enough for a CPU. The paper (section 4.1) trains 200,000 iterations, 50,000 of
+    InfoNeRF, of 1024 rays."""
 
-    size: Literal["paper", "small", "tiny"]
-    iterations: int
-    info_iterations: int
-    rays: int
-    samples: tuple[int, int] | None = None
-    """Coarse and importance samples of a ray; None: the size's."""
-    image_size: int | None = None
-    """Of synthetic scenes, in pixels; None: the data is given."""
+    size: Literal["paper", "small", "tiny"] = "tiny"
+    iterations: int = 1000
+    info_iterations: int = 600
+    rays: int = 64
+    samples: tuple[int, int] = (16, 16)
+    """Coarse and importance samples of a ray."""
+    image_size: int = 64
+    """Rows and columns of the images."""
     num_train: int = 50
     num_test: int = 4
-
-
-PRESETS = {
-    "cpu": Settings("tiny", iterations=1000, info_iterations=600, rays=64, samples=(16, 16), image_size=64),
-    # section 4.1 of the paper: 200,000 iterations, 50,000 for InfoNeRF, 1024 rays
-    "paper": Settings("paper", iterations=200_000, info_iterations=50_000, rays=1024),
-}
 
 
 @dataclass(frozen=True)
@@ -144,11 +134,10 @@ def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path)
         MANAGER: strategy.pipeline.datamanager,
         f"{MANAGER}.train_num_rays_per_batch": settings.rays,
         f"{MODEL}.size": settings.size,
+        f"{MODEL}.num_coarse_samples": settings.samples[0],
+        f"{MODEL}.num_importance_samples": settings.samples[1],
         **table.changes,
     }
-    if settings.samples is not None:
-        names = (f"{MODEL}.num_coarse_samples", f"{MODEL}.num_importance_samples")
-        changes |= dict(zip(names, settings.samples, strict=True))
     return override(methods["info-nerf"] if table.method == "info-nerf" else strategy, changes)
 
 
@@ -168,24 +157,3 @@ def synthetic_scene(table: int, scene: str, settings: Settings, workplace: Path)
     """The folder of a synthetic scene as a table's trials see it, rendered where it is missing."""
     counts = {"num_train": settings.num_train, "num_val": 1, "num_test": settings.num_test}
     return cached_scene(workplace, scene, size=settings.image_size, placement=TABLES[table].placement, **counts)
-
-
-def real_scene(data: Path, scene: str, placement: str, workplace: Path) -> Path:
-    """A scene of a NeRF-synthetic folder; padded or shifted, it is written to workplace/scenes/offcenter at first."""
-    if placement == "centered":
-        return data / ANALOG_OF[scene]
-    counterparts = workplace / "scenes" / "offcenter" / scene
-    if not counterparts.exists():
-        with Progress(0, f"moving {scene} off the centre") as progress:
-            offcenter(data / ANALOG_OF[scene], counterparts, progress=progress.update)
-    return counterparts / {"padded": "centered", "shifted": "shifted"}[placement]
-
-
-def check_data(data: Path, scenes: Iterable[str]) -> None:
-    """InputError if a NeRF-synthetic folder lacks a scene's training or test split."""
-    for scene, split in product(scenes, ("train", "test")):
-        if not has_split(data / ANALOG_OF[scene], split):
-            raise InputError(
-                f"--data {data}: {ANALOG_OF[scene]}/transforms_{split}.json is missing; a NeRF-synthetic folder "
-                "has one folder a scene (chair, drums, ficus, hotdog, lego, materials, mic); fewer: name --scenes"
-            )

@@ -25,7 +25,7 @@ class BenchSchedule(ExperimentCommand):
     """Of the comparison with fixed early phases, over planned lengths; the best fixed one is selected on others."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.paper.trials import PRESETS, synthetic_scene
+        from edge_se_sampler.bench.paper import trials as paper
         from edge_se_sampler.bench.runner import Experiment
         from edge_se_sampler.bench.schedule import trials as schedule
 
@@ -40,7 +40,7 @@ class BenchSchedule(ExperimentCommand):
             return failures + (schedule.list_length_trials(runs, self.length_seeds) if "lengths" in self.parts else [])
 
         def arguments(trial: schedule.Trial) -> tuple[object, ...]:
-            data = synthetic_scene(trial.table, trial.scene, PRESETS["cpu"], self.workplace)
+            data = paper.synthetic_scene(trial.table, trial.scene, paper.Settings(), self.workplace)
             return data, self.workplace / "runs"
 
         return Experiment("schedule", settings, trials, schedule.run_trial, arguments)

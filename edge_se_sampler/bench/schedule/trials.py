@@ -29,7 +29,7 @@ SCENES_OF_LENGTHS = ((1, "drums"), (1, "bricks"), (2, "chair"), (2, "mic"))
 
 @dataclass(frozen=True)
 class Settings:
-    """How large the experiment is; the rest is `bench paper`'s cpu preset."""
+    """How large the experiment is; the rest is as in `bench paper`."""
 
     iterations: int = 500
     """Of the part "failures"."""
@@ -101,7 +101,7 @@ def best_share(scores: dict[str, float]) -> str:
 
 def build_config(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
     strategy = "vanilla-nerf" if trial.arm == "random" else "edge-se-nerf"
-    settings = replace(paper.PRESETS["cpu"], iterations=trial.iterations)
+    settings = replace(paper.Settings(), iterations=trial.iterations)
     paper_trial = paper.Trial(trial.table, trial.scene, strategy, trial.seed)
     changes: dict[str, Any] = {"experiment_name": trial.name}
     if trial.arm == "adaptive":
