@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import time
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +39,7 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
 
     Returns:
         the measures of `evaluate` and of `measure_outcome`; which networks were dead before the first step, and how
-        often one was reinitialized; steps, seconds and CPU seconds of training; the training loss at every
-        `loss_every`th step; and `phases`, [step, what pixels are drawn by] wherever that changed.
+        often one was reinitialized; steps, seconds and CPU seconds of training.
     """
     torch.set_num_threads(1)  # there are as many trainings at once as cores
     with contextlib.redirect_stderr(io.StringIO()):  # progress bars of several processes would mix
@@ -59,17 +56,12 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
     if view_path is not None:
         view_path.parent.mkdir(parents=True, exist_ok=True)
         write_image(view_path, views[0])
-    metrics, every = trainer.run.metrics(), trainer.config.steps_per_log
-    drawn = [line for line in metrics if "strategy" in line]
     return {
         **{key: results[key] for key in ("psnr", "foreground_psnr", "edge_band_psnr", "background_mse")},
         **measure_outcome(results, pictures, model.config.background_level),
         "dead_at_start": dead,
-        "reinitialized": sum("reinitialized" in line for line in metrics),
+        "reinitialized": sum("reinitialized" in line for line in trainer.run.metrics()),
         "steps": trainer.next_step,
         "seconds": round(trainer.elapsed, 3),
         "cpu_seconds": round(cpu_seconds, 3),
-        "loss_every": every,
-        "loss": [float(f"{line['loss']:.4g}") for line in metrics if "loss" in line and line["step"] % every == 0],
-        "phases": [[next(lines)["step"], strategy] for strategy, lines in groupby(drawn, itemgetter("strategy"))],
     }

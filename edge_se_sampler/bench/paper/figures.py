@@ -1,4 +1,4 @@
-"""The paper's figures 2, 5 and 6 redrawn from runs, and a sheet with a rendering of every trial of its tables.
+"""The paper's figure 2 redrawn from runs, and a sheet with a rendering of every trial of its tables.
 
 A folder of views holds the first test view as every trial renders it, TRIAL.png, and of every scene the first view of
 each split, PLACEMENT-SCENE-{train,test}.png.
@@ -6,7 +6,6 @@ each split, PLACEMENT-SCENE-{train,test}.png.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
@@ -19,11 +18,10 @@ from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.paper.published import LABELS, SCENES
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, TABLES, Trial, runs_by_trial
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.engine.figures import require_pyplot, save_figure, style_axes
-from edge_se_sampler.engine.metrics import composite_on, edge_band
+from edge_se_sampler.engine.figures import require_pyplot, save_figure
+from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.sampling.edges import unit_float
 
-COLORS = {"vanilla-nerf": "#1f77b4", "precrop-nerf": "#ff7f0e", "edge-nerf": "#2ca02c"}  # the paper's
 FAILED = "#d62728"
 
 Runs = dict[Trial, Run]
@@ -31,21 +29,11 @@ Runs = dict[Trial, Run]
 
 def draw_figures(runs: list[Run], views: Path, folder: Path) -> None:
     """Draw every picture of which all runs and renderings are there; leave the others as they are."""
-    for name, draw in {"sheet": _sheet, "figure-2": _figure_2, "figure-5": _figure_5, "figure-6": _figure_6}.items():
+    for name, draw in {"sheet": _sheet, "figure-2": _figure_2}.items():
         with suppress(FileNotFoundError):
             figure = draw(runs_by_trial(runs), views)
             if figure is not None:
                 save_figure(figure, folder / f"{name}.png")
-
-
-def _scenes_with_all(runs: Runs, scenes: Iterable[str], tables: Iterable[int], strategies: Iterable[str]) -> list[str]:
-    """The scenes of which every table and strategy has a run of the first seed."""
-    seed, keys = min((trial.seed for trial in runs), default=0), list(product(tables, strategies))
-    return [s for s in scenes if all(Trial(table, s, strategy, seed) in runs for table, strategy in keys)]
-
-
-def _runs_of_all_seeds(runs: Runs, table: int, scene: str, strategy: str) -> list[Run]:
-    return [runs[trial] for trial in runs if (trial.table, trial.scene, trial.strategy) == (table, scene, strategy)]
 
 
 def _read_view(views: Path, table: int, scene: str, split: str = "test") -> np.ndarray:
@@ -53,12 +41,12 @@ def _read_view(views: Path, table: int, scene: str, split: str = "test") -> np.n
     return unit_float(iio.imread(views / f"{TABLES[table].placement}-{scene}-{split}.png"))
 
 
-def _show(axis: Any, image: np.ndarray | None, frame: str | None = None, **options: Any) -> None:
+def _show(axis: Any, image: np.ndarray | None, frame: str | None = None) -> None:
     axis.set(xticks=[], yticks=[])
     for spine in axis.spines.values():
         spine.set(visible=frame is not None, color=frame, linewidth=2)
     if image is not None:
-        axis.imshow(image, interpolation="nearest", **options)
+        axis.imshow(image, interpolation="nearest")
 
 
 def _show_rendering(axis: Any, runs: Runs, trial: Trial, views: Path, frame: str | None = None) -> None:
@@ -96,10 +84,12 @@ def _sheet(runs: Runs, views: Path) -> Any:
 def _figure_2(runs: Runs, views: Path) -> Any:
     """What Precrop's window shows of a centred and of an off-centre object, and what each seed comes to."""
     titles = {1: "centred", 16: "as small, centred", 2: "off centre"}
-    scenes = _scenes_with_all(runs, ("mic", "drums"), titles, ("precrop-nerf",))
+    seeds = sorted({trial.seed for trial in runs})[:3]
+    first = [trial for trial in runs if (trial.strategy, trial.seed) == ("precrop-nerf", seeds[0])]
+    scenes = [scene for scene in ("mic", "drums") if {*titles} <= {t.table for t in first if t.scene == scene}]
     if not scenes:
         return None
-    columns, seeds = list(product(scenes, titles)), sorted({trial.seed for trial in runs})[:3]
+    columns = [*product(scenes, titles)]
     size = (2.0 * len(columns), 2.3 * (1 + len(seeds)))
     figure, axes = require_pyplot().subplots(1 + len(seeds), len(columns), figsize=size, squeeze=False)
     for column, (scene, table) in zip(axes.T, columns, strict=True):
@@ -119,63 +109,5 @@ def _figure_2(runs: Runs, views: Path) -> Any:
                 axis.set_xlabel(f"{run['psnr']:.2f} dB (background {run['background_psnr']:.2f})", fontsize=8)
     for axis, label in zip(axes[:, 0], ("a training view", *(f"Precrop, seed {seed}" for seed in seeds)), strict=True):
         axis.set_ylabel(label, fontsize=9)
-    figure.tight_layout()
-    return figure
-
-
-def _figure_5(runs: Runs, views: Path) -> Any:
-    """Training losses of Random, Precrop and Edge, a line for each seed; a collapsed run stays at its first loss."""
-    scenes = _scenes_with_all(runs, ("chair", "ficus"), (1, 2), ("vanilla-nerf",))
-    if not scenes:
-        return None
-    size = (4.6 * len(scenes), 5.8)
-    figure, axes = require_pyplot().subplots(2, len(scenes), figsize=size, squeeze=False, sharex=True)
-    for table, row in enumerate(axes, 1):
-        for axis, scene in zip(row, scenes, strict=True):
-            for strategy, color in COLORS.items():
-                for i, run in enumerate(_runs_of_all_seeds(runs, table, scene, strategy)):
-                    losses = _running_median(np.array(run["loss"]))
-                    steps = run["loss_every"] * np.arange(len(losses))
-                    axis.plot(steps, losses, color=color, lw=1, alpha=0.8, label=LABELS[strategy] if i == 0 else None)
-            axis.axvline(axis.dataLim.xmax / 10, color="black", ls=":", lw=1)
-            axis.set(yscale="log")
-            axis.set_title(f"{scene}, {'centred' if table == 1 else 'off centre'}", fontsize=10)
-    style_axes(*axes.flat)
-    figure.supxlabel("iterations (dotted: the early phase ends)", fontsize=10)
-    figure.supylabel("training loss", fontsize=10)
-    axes[0, -1].legend(frameon=False, fontsize=8)
-    figure.tight_layout()
-    return figure
-
-
-def _running_median(values: np.ndarray, reach: int = 3) -> np.ndarray:
-    """Over seven steps: every step trains on one image, and images differ."""
-    padded = np.pad(values, reach, constant_values=np.nan)
-    return np.nanmedian(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
-
-
-def _figure_6(runs: Runs, views: Path) -> Any:
-    """Where Precrop and Edge err near edges, centred: renderings, and errors in the edge band."""
-    strategies = ("precrop-nerf", "edge-nerf")
-    scenes = _scenes_with_all(runs, ("chair", "drums"), (1,), strategies)
-    if not scenes:
-        return None
-    seed = min(trial.seed for trial in runs)
-    figure, axes = require_pyplot().subplots(len(scenes), 5, figsize=(11.5, 3.0 * len(scenes)), squeeze=False)
-    for row, scene in zip(axes, scenes, strict=True):
-        truth = composite_on(_read_view(views, 1, scene))
-        band = edge_band(truth)
-        _show(row[0], truth)
-        row[0].set_title(f"{scene}: ground truth", fontsize=9)
-        renderings = [unit_float(iio.imread(views / f"{Trial(1, scene, name, seed).name}.png")) for name in strategies]
-        errors = [((rendering - truth) ** 2).mean(axis=2) for rendering in renderings]
-        largest = max(float(np.quantile(error[band], 0.98)) for error in errors)
-        for i, (strategy, rendering, error) in enumerate(zip(strategies, renderings, errors, strict=True)):
-            mean = np.mean([10 ** (-r["edge_band_psnr"] / 10) for r in _runs_of_all_seeds(runs, 1, scene, strategy)])
-            _show(row[1 + i], rendering)
-            row[1 + i].set_title(LABELS[strategy], fontsize=9)
-            _show(row[3 + i], np.where(band, error, 0), cmap="magma", vmin=0, vmax=largest)
-            row[3 + i].set_title(f"{LABELS[strategy]}: error near edges", fontsize=9)
-            row[3 + i].set_xlabel(f"MSE {error[band].mean():.5f} here,\n{mean:.5f} over views and seeds", fontsize=8)
     figure.tight_layout()
     return figure

@@ -129,7 +129,6 @@ def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path)
         "max_num_iterations": iterations,
         "steps_per_save": iterations,
         "steps_per_eval_image": iterations,
-        "steps_per_log": max(1, iterations // 50),
         "machine": MachineConfig(seed=trial.seed, device_type="auto"),
         MANAGER: strategy.pipeline.datamanager,
         f"{MANAGER}.train_num_rays_per_batch": settings.rays,

@@ -113,5 +113,4 @@ def build_config(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
 
 def run_trial(trial: Trial, data: Path, output_dir: Path) -> Run:
     """Train a trial and measure it."""
-    run = train_and_measure(build_config(trial, data, output_dir))
-    return {key: value for key, value in run.items() if key not in ("loss", "loss_every")}
+    return train_and_measure(build_config(trial, data, output_dir))
