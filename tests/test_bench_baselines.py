@@ -174,9 +174,6 @@ RESULT = {
     [
         "{", "[]", {**RESULT, "runs": 3}, {**RESULT, "version": 1},
         {**RESULT, "settings": {key: value for key, value in SETTINGS.items() if key != "program_version"}},
-        {**RESULT, "runs": [{"scene": "mic", "seed": 0, "curve": [[2, 20.0], [1, 21.0]]}]},
-        {**RESULT, "runs": [{"scene": "mic", "seed": 0, "curve": []}]},
-        {**RESULT, "runs": [{"scene": "mic", "seed": 0, "curve": [[1, "much"]]}]},
     ],
 )  # fmt: skip
 def test_a_file_of_another_format_is_refused(content: Any, tmp_path: Path) -> None:

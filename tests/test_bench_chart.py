@@ -145,14 +145,6 @@ def test_medians_over_seeds_then_means_over_scenes() -> None:
     assert mean_psnr_at(runs, 1) is None  # one scene has not been evaluated yet
 
 
-def test_the_upper_envelope_is_the_best_variant_at_every_evaluation(tmp_path: Path) -> None:
-    runs = [run_of("lean", "mic", 0, [(1, 20), (60, 30)]), run_of("edge", "mic", 0, [(1, 25), (60, 28)])]
-    runs += [run_of("se", "mic", 0, [(3, 10), (20, 10)])]
-    text = describe(folder_of(tmp_path, runs)).split("## Which variant is best when")[1]
-    assert row_of(text, "1 s") == ["Edge", "25.00", "5.00"]
-    assert row_of(text, "end") == ["lean-nerf", "30.00", "0.00"]
-
-
 def test_only_common_scenes_and_seeds_are_compared() -> None:
     runs = [run_of("lean", scene, 0, [(1, 20)]) for scene in ("mic", "chair")] + [run_of("edge", "mic", 0, [(1, 9)])]
     assert {run["scene"] for found in comparable(by_variant(runs)).values() for run in found} == {"mic"}

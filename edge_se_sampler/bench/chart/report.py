@@ -15,7 +15,6 @@ from edge_se_sampler.bench.chart.summary import (
     by_variant,
     comparable,
     mean_psnr_at,
-    moments_of,
     runs_on,
     scenes_of,
 )
@@ -53,7 +52,6 @@ def describe(folder: Path) -> str:
         number=len(runs),
         failure_rule=FAILURE_RULE,
         **{group: _describe_group(runs, group, baselines) for group in GROUPS},
-        envelope=_describe_envelope(runs),
         every_scene=_compare_scenes(runs, baselines),
         notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
         reproduce=describe_command(*baseline_results, result),
@@ -91,7 +89,8 @@ def _describe_group(runs: list[Run], group: str, baselines: Baselines) -> str:
 def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool = True) -> str:
     """A group's variants, and baselines beside methods: PSNR, failures and costs."""
     compared = _comparable_with_group(runs, group)
-    moments = [seconds for seconds in moments_of(runs) if seconds in COLUMNS]
+    longest = max((run["seconds"] for run in runs), default=0.0)
+    moments = [seconds for seconds in COLUMNS if seconds == END or 1.05 * seconds < longest]
     shown = {
         VARIANTS[n].label: found for n, found in compared.items() if VARIANTS[n].group == group or n == RECOMMENDED
     }
@@ -104,22 +103,6 @@ def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool 
         rows.append([label, *psnr, _failures(found), *(_cost_fields(found) if costs else ())])
     head = ["", *(COLUMNS[seconds] for seconds in moments), "failed"]
     return markdown_table([*head, *(("ms a step", "queries a step", "memory") if costs else ())], rows)
-
-
-def _describe_envelope(runs: list[Run]) -> str:
-    """Which variant is best when, and by how much."""
-    compared, rows = comparable(by_variant(runs)), []
-    if len(compared) < 2:
-        return ""
-    for seconds in moments_of(runs):
-        psnr = {name: value for name, found in compared.items() if (value := mean_psnr_at(found, seconds)) is not None}
-        if psnr:
-            best = max(psnr, key=psnr.__getitem__)
-            gap = psnr[best] - psnr[RECOMMENDED] if RECOMMENDED in psnr else None
-            moment = "end" if seconds == END else f"{seconds} s"
-            rows.append([moment, VARIANTS[best].full_label, decimals(psnr[best]), decimals(gap)])
-    table = markdown_table(["after", "best", "PSNR", f"{VARIANTS[RECOMMENDED].label} below it"], rows)
-    return f"On {_list_scenes(compared)}:\n\n{table}"
 
 
 def _compare_scenes(runs: list[Run], baselines: Baselines) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from edge_se_sampler.bench.chart.trials import EVAL_SECONDS
 from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, VARIANTS
 from edge_se_sampler.bench.runner import Run
 
@@ -27,12 +26,6 @@ def runs_on(runs: list[Run], scenes: Collection[str]) -> list[Run]:
     """The runs on some scenes; none if one of the scenes has none."""
     found = [run for run in runs if run["scene"] in scenes]
     return found if {run["scene"] for run in found} == set(scenes) else []
-
-
-def moments_of(runs: list[Run]) -> list[float]:
-    """The seconds of evaluations before the last one, and END."""
-    longest = max((run["seconds"] for run in runs), default=0.0)
-    return [*(seconds for seconds in EVAL_SECONDS if 1.05 * seconds < longest), END]
 
 
 def psnr_at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
