@@ -13,15 +13,16 @@ import pytest
 import torch
 
 from edge_se_sampler.bench import runner
+from edge_se_sampler.bench.outcomes import Outcome
 from edge_se_sampler.bench.stability import report, scenes
 from edge_se_sampler.bench.stability import train as train_module
 from edge_se_sampler.bench.stability.scenes import COLORS, background_of, render_splits
 from edge_se_sampler.bench.stability.settings import AXES, PAIRS, SETTINGS, Setting, Trial
 from edge_se_sampler.bench.stability.train import (
-    Rendered,
     TrainingSize,
     build_trainer,
-    render_networks,
+    failure_mode,
+    measure_views,
     run_trial,
 )
 from edge_se_sampler.engine.reinitialization import dead_networks
@@ -93,25 +94,19 @@ def test_backgrounds() -> None:
 # -- how a training ends
 
 
-def rendered(share: float, gain: float = 5.0, accumulation: float = 0.0) -> Rendered:
-    return Rendered(share=share, psnr=20 + gain, background_psnr=20, accumulation=accumulation)
-
-
 @pytest.mark.parametrize(
-    ("result", "dead_at_start", "mode"),
+    ("outcome", "accumulation", "dead_at_start", "mode"),
     [
-        (rendered(0.2), False, None),
-        (rendered(0.2), True, None),  # it was reinitialized
-        (rendered(0.5, 0.4), False, "underfit"),
-        (rendered(0.89, -3), False, "underfit"),
-        (rendered(1.0, 0), True, "dead at the start"),
-        (rendered(1.0, 0), False, "emptied"),
-        (rendered(1.0, 0, accumulation=1.0), False, "opaque background"),
-        (rendered(0.95, 0.6), False, "emptied"),
+        ("converged", 0.0, False, None),
+        ("converged", 0.0, True, None),  # it was reinitialized
+        ("underfit", 1.0, True, "underfit"),
+        ("collapsed", 0.0, True, "dead at the start"),
+        ("collapsed", 0.0, False, "emptied"),
+        ("collapsed", 1.0, False, "opaque background"),
     ],
 )
-def test_failure_modes(result: Rendered, dead_at_start: bool, mode: str | None) -> None:
-    assert result.failure_mode(dead_at_start) == mode
+def test_failure_modes(outcome: Outcome, accumulation: float, dead_at_start: bool, mode: str | None) -> None:
+    assert failure_mode(outcome, accumulation, dead_at_start) == mode
 
 
 def constant_model(raw_density: float, setting: Setting, folder: Path) -> tuple[NeRFModel, Any]:
@@ -130,29 +125,27 @@ def constant_model(raw_density: float, setting: Setting, folder: Path) -> tuple[
 def test_an_empty_network_shows_the_background_alone(tmp_path: Path) -> None:
     model, pictures = constant_model(-1.0, BASE, tmp_path)
     assert dead_networks(model, [picture.rays(CPU) for picture in pictures]) == ["coarse", "fine"]
-    for result in render_networks(model, pictures).values():
-        assert result.share == pytest.approx(1)
-        assert result.psnr == pytest.approx(result.background_psnr)
-        assert result.accumulation == 0
-        assert result.failure_mode(dead_at_start=False) == "emptied"
+    measured = measure_views(model, pictures)
+    assert measured["foreground_share"] == pytest.approx(1)
+    assert measured["psnr"] == pytest.approx(measured["background_psnr"])
+    assert measured["accumulation"] == 0
 
 
 def test_an_opaque_white_network_has_collapsed_although_it_is_not_dead(tmp_path: Path) -> None:
     model, pictures = constant_model(50.0, BASE, tmp_path)
     assert dead_networks(model, [picture.rays(CPU) for picture in pictures]) == []
-    result = render_networks(model, pictures)["fine"]
-    assert result.accumulation > 0.99
-    assert result.failure_mode(dead_at_start=False) == "opaque background"
+    measured = measure_views(model, pictures)
+    assert measured["accumulation"] > 0.99
+    assert measured["foreground_share"] == pytest.approx(1, abs=0.05)
 
 
 def test_a_network_with_small_errors_has_converged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer, pictures = build_trainer(BASE, "vanilla-nerf", 0, SMALL, tmp_path)
     model = trainer.pipeline.model
     monkeypatch.setattr(model, "squared_error", lambda outputs, image, network: torch.full((len(image),), 1e-4))
-    result = render_networks(model, pictures)["coarse"]
-    assert result.share < 0.01
-    assert result.psnr == pytest.approx(-10 * np.log10(1e-4 / 3))
-    assert result.outcome == "converged"
+    measured = measure_views(model, pictures)
+    assert measured["foreground_share"] < 0.01
+    assert measured["psnr"] == pytest.approx(-10 * np.log10(1e-4 / 3))
 
 
 # -- a training
@@ -196,7 +189,6 @@ def test_a_run_repeats_itself() -> None:
     trial = Trial("torch initialisation", "vanilla-nerf", 5)
     run, repeated = (run_trial(trial, SMALL) for _ in range(2))
     assert run["failure_mode"] is not None  # after four steps
-    assert len(run["shares"]) == 4
     del run["cpu_seconds"], repeated["cpu_seconds"]
     assert run == repeated == json.loads(json.dumps(run))
 

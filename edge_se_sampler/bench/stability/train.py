@@ -1,4 +1,4 @@
-"""One training of the sweep: how its coarse and its fine network end."""
+"""One training of the sweep, and how it ends."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import io
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,6 @@ from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
 
-NUM_EVALUATIONS = 10
-"""Of a training, on its way."""
-
 
 @dataclass(frozen=True)
 class TrainingSize:
@@ -42,38 +39,12 @@ class TrainingSize:
     """Coarse ones, and as many importance samples."""
 
 
-@dataclass(frozen=True)
-class Rendered:
-    """What a network shows of held-out views."""
-
-    share: float
-    """Squared error on the object as a share of the background's alone."""
-    psnr: float
-    background_psnr: float
-    """Of the background alone."""
-    accumulation: float
-    """Mean opacity, in [0, 1], of the rays that miss the object."""
-
-    @property
-    def outcome(self) -> Outcome:
-        return classify(self.psnr, self.background_psnr, self.share)
-
-    def failure_mode(self, dead_at_start: bool) -> str | None:
-        """How the network failed, if it did; dead_at_start: it had no density anywhere before the first step."""
-        if self.outcome != "collapsed":
-            return None if self.outcome == "converged" else self.outcome
-        if dead_at_start:
-            return "dead at the start"
-        return "opaque background" if self.accumulation > 0.5 else "emptied"
-
-
 def run_trial(trial: Trial, size: TrainingSize) -> dict[str, Any]:
     """Train once; called in a process of its own.
 
     Returns:
-        outcome and failure_mode of the fine network and coarse_failure_mode; what both networks render
-        (`Rendered`); which were dead_at_start; how many were reinitialized; the fine one's `share` at each of
-        NUM_EVALUATIONS evaluations; cpu_seconds.
+        outcome and failure_mode; what `measure_views` measures; which networks were dead_at_start; how many were
+        reinitialized; cpu_seconds.
     """
     torch.set_num_threads(1)
     disable_malloc_trimming()
@@ -81,23 +52,28 @@ def run_trial(trial: Trial, size: TrainingSize) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         trainer, pictures = build_trainer(SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder))
         model = trainer.pipeline.model
-        dead, shares = dead_networks(model, [picture.rays(model.device)[::2] for picture in pictures]), []
+        dead = dead_networks(model, [picture.rays(model.device)[::2] for picture in pictures])
         for step in range(size.iterations):
             trainer.train_iteration(step)
-            if (step + 1) % max(1, size.iterations // NUM_EVALUATIONS) == 0:
-                shares.append(round(render_networks(model, pictures, stride=5)["fine"].share, 4))
-        resets = trainer.dead_network_reset
-    rendered = render_networks(model, pictures)
+    resets, measured = trainer.dead_network_reset, measure_views(model, pictures)
+    outcome = classify(measured["psnr"], measured["background_psnr"], measured["foreground_share"])
     return {
-        "outcome": rendered["fine"].outcome,
-        "failure_mode": rendered["fine"].failure_mode("fine" in dead),
-        "coarse_failure_mode": rendered["coarse"].failure_mode("coarse" in dead),
-        **{f"{name}_{key}": round(value, 4) for name in rendered for key, value in asdict(rendered[name]).items()},
+        "outcome": outcome,
+        "failure_mode": failure_mode(outcome, measured["accumulation"], "fine" in dead),
+        **{key: round(value, 4) for key, value in measured.items()},
         "dead_at_start": dead,
         "reinitialized": 0 if resets is None else resets.used_sub_seeds,
-        "shares": shares,
         "cpu_seconds": round(time.process_time() - start, 2),
     }
+
+
+def failure_mode(outcome: Outcome, accumulation: float, dead_at_start: bool) -> str | None:
+    """How a network failed, if it did; dead_at_start: it had no density anywhere before the first step."""
+    if outcome != "collapsed":
+        return None if outcome == "converged" else outcome
+    if dead_at_start:
+        return "dead at the start"
+    return "opaque background" if accumulation > 0.5 else "emptied"
 
 
 def build_trainer(
@@ -133,21 +109,20 @@ def build_trainer(
     return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), to_pictures(test)
 
 
-def render_networks(model: NeRFModel, pictures: list[Picture], stride: int = 1) -> dict[str, Rendered]:
-    """What the coarse and the fine network show of held-out views, measured on every stride-th pixel."""
-    keys = ["background", *(f"{output}_{network}" for network in model.networks for output in ("rgb", "accumulation"))]
-    views = [render_outputs(model, picture.rays(model.device)[::stride], keys) for picture in pictures]
+def measure_views(model: NeRFModel, pictures: list[Picture]) -> dict[str, float]:
+    """What the fine network shows of held-out views: psnr; foreground_share, the squared error on the object as a share
+    of the background's alone; background_psnr, of the background alone; and accumulation, the mean opacity, in [0, 1],
+    of the rays that miss the object."""
+    keys = ("background", "rgb_fine", "accumulation_fine")
+    views = [render_outputs(model, picture.rays(model.device), keys) for picture in pictures]
     outputs = {key: torch.cat([view[key] for view in views]) for key in keys}
-    image = torch.cat([torch.from_numpy(picture.image).reshape(-1, 4)[::stride] for picture in pictures])
+    image = torch.cat([torch.from_numpy(picture.image).reshape(-1, 4) for picture in pictures])
     hits, background = image[:, 3] > 0, outputs["background"]
+    error = model.squared_error(outputs, image, "fine")
     background_error = (target_colors(image, background) - background).square().sum(dim=1)
-    rendered = {}
-    for network in model.networks:
-        error = model.squared_error(outputs, image, network)
-        rendered[network] = Rendered(
-            share=float(error[hits].sum() / background_error[hits].sum()),
-            psnr=psnr(float(error.mean() / 3)),
-            background_psnr=psnr(float(background_error.mean() / 3)),
-            accumulation=float(outputs[f"accumulation_{network}"][~hits].mean()),
-        )
-    return rendered
+    return {
+        "foreground_share": float(error[hits].sum() / background_error[hits].sum()),
+        "psnr": psnr(float(error.mean() / 3)),
+        "background_psnr": psnr(float(background_error.mean() / 3)),
+        "accumulation": float(outputs["accumulation_fine"][~hits].mean()),
+    }
