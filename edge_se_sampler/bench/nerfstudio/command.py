@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchNerfstudio(ExperimentCommand):
-    """Count failed trainings inside nerfstudio, with its own pixel sampler and with Edge + SE, and measure what a step
-    costs. Needs nerfstudio 1.1.5 in the same environment. Resumes."""
+    """Count failed trainings inside nerfstudio, with its own pixel sampler and with Edge + SE. Needs nerfstudio 1.1.5
+    in the same environment. Resumes."""
 
     seeds: tuple[int, ...] = tuple(range(10))
     """Of weights, pixels and jitter."""
@@ -36,18 +36,6 @@ class BenchNerfstudio(ExperimentCommand):
             return settings, render_scene(self.workplace), self.workplace
 
         return Experiment("nerfstudio", settings, lambda _: trials, run_trial, arguments)
-
-    def run(self) -> None:
-        """Train, measure costs unless the result has them, and report. InputError: as the base class."""
-        from edge_se_sampler.bench.nerfstudio.train import measure_costs, render_scene
-        from edge_se_sampler.bench.report import write_report
-        from edge_se_sampler.bench.runner import read_result, write_result
-
-        super().run()
-        path = self.output_dir / "result.json"
-        if not self.dry_run and "costs" not in (result := read_result(path)):
-            write_result(path, result | {"costs": measure_costs(render_scene(self.workplace), self.workplace)})
-            write_report(self.output_dir, workplace=self.workplace)
 
     def default_workers(self) -> int:
         """One: a training uses as many threads as torch takes."""
