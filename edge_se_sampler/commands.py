@@ -29,7 +29,7 @@ class Demo:
     """Seed of weights, pixels and jitter; both methods start from the same weights."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.demo.train import METHODS, run_demo
+        from edge_se_sampler.bench.demo import METHODS, run_demo
 
         for method, measured in run_demo(self.output_dir, self.seed)["methods"].items():
             psnr, seconds = measured["results"]["psnr"], measured["training_seconds"]

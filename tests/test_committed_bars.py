@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from edge_se_sampler.bench import demo
 from edge_se_sampler.bench.chart.summary import mean_psnr_at
 from edge_se_sampler.bench.chart.variants import VARIANTS
-from edge_se_sampler.bench.demo import train as demo
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.train import cached_scene
 
