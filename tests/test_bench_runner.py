@@ -17,14 +17,8 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench.runner import (
-    Experiment,
-    Run,
-    executor_factory,
-    list_trials,
-    run_experiment,
-    run_in_subprocess,
-)
+from edge_se_sampler.bench.command import Experiment, Run
+from edge_se_sampler.bench.runner import executor_factory, list_trials, run_experiment, run_in_subprocess
 from edge_se_sampler.errors import InputError
 
 

@@ -1,19 +1,40 @@
-"""What the commands of all experiments have in common. Torch-free until one runs."""
+"""What an experiment is, and what the commands of all experiments have in common. Torch-free until one runs.
+
+trial   what identifies a training: a frozen dataclass of plain values, with a `name`
+run     a trial's fields and what was measured
+"""
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import tyro
 
 from edge_se_sampler.errors import check_value
 
-if TYPE_CHECKING:
-    from edge_se_sampler.bench.runner import Experiment
+Run = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is trained, and how large."""
+
+    name: str
+    """As in `edge-se bench NAME`; the report is chosen by it."""
+    settings: Any
+    """A dataclass of plain values; a result.json of other settings is refused."""
+    trials: Callable[[list[Run]], Sequence[Any]]
+    """Runs so far -> the trials to train. Called again until none is pending, so that later trials may depend on
+    earlier results."""
+    train: Callable[..., Run]
+    """(trial, *arguments(trial)) -> its run; called in another process, so a function of a module."""
+    arguments: Callable[[Any], tuple[Any, ...]]
+    """Trial -> further arguments of `train`, for instance the scene's folder; called in this process."""
 
 
 @dataclass(frozen=True, kw_only=True)

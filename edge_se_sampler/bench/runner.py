@@ -1,7 +1,6 @@
 """Many trainings in parallel processes, kept in one result.json: every finished one stays, a later call goes on.
 
-trial   what identifies a training: a frozen dataclass of plain values, with a `name`
-run     a trial's fields and what was measured
+Trial, run and experiment: see `bench.command`.
 """
 
 from __future__ import annotations
@@ -15,10 +14,11 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.command import Experiment, Run
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.engine.files import make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
@@ -28,25 +28,7 @@ VERSION = 2
 MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
-Run = dict[str, Any]
 ExecutorFactory = Callable[[], Executor]
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """What is trained, and how large."""
-
-    name: str
-    """As in `edge-se bench NAME`; the report is chosen by it."""
-    settings: Any
-    """A dataclass of plain values; a result.json of other settings is refused."""
-    trials: Callable[[list[Run]], Sequence[Any]]
-    """Runs so far -> the trials to train. Called again until none is pending, so that later trials may depend on
-    earlier results."""
-    train: Callable[..., Run]
-    """(trial, *arguments(trial)) -> its run; called in another process, so a function of a module."""
-    arguments: Callable[[Any], tuple[Any, ...]]
-    """Trial -> further arguments of `train`, for instance the scene's folder; called in this process."""
 
 
 def list_trials(experiment: Experiment, output_dir: Path) -> None:

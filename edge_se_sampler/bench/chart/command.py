@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_se_sampler.bench.chart.variants import VARIANTS
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import Experiment, ExperimentCommand
 from edge_se_sampler.errors import InputError, check_known, check_value
 
 if TYPE_CHECKING:
     from edge_se_sampler.bench.chart.trials import ChartSettings
-    from edge_se_sampler.bench.runner import Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +70,7 @@ class BenchChart(ChartOptions, ExperimentCommand):
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.baselines.results import read_baselines
         from edge_se_sampler.bench.chart.trials import Trial, train_and_evaluate
-        from edge_se_sampler.bench.runner import Experiment, run_in_subprocess
+        from edge_se_sampler.bench.runner import run_in_subprocess
 
         check_known("variants", self.variants, VARIANTS)
         settings = self.settings()

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import Experiment, ExperimentCommand
 from edge_se_sampler.errors import InputError
-
-if TYPE_CHECKING:
-    from edge_se_sampler.bench.runner import Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +21,6 @@ class BenchNerfstudio(ExperimentCommand):
         from importlib.util import find_spec
 
         from edge_se_sampler.bench.nerfstudio.train import METHODS, TrainingSettings, Trial, render_scene, run_trial
-        from edge_se_sampler.bench.runner import Experiment
 
         if find_spec("nerfstudio") is None or find_spec("torchvision") is None:
             raise InputError("bench nerfstudio needs all of nerfstudio 1.1.5 beside edge_se_sampler in one environment")

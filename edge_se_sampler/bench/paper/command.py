@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import Experiment, ExperimentCommand
 from edge_se_sampler.errors import InputError, check_known
-
-if TYPE_CHECKING:
-    from edge_se_sampler.bench.runner import Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +21,6 @@ class BenchPaper(ExperimentCommand):
 
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.paper import trials as paper
-        from edge_se_sampler.bench.runner import Experiment
 
         check_known("tables", self.tables, paper.TABLES)
         check_known("scenes", self.scenes, paper.SCENES)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import Experiment, ExperimentCommand, Run
 from edge_se_sampler.errors import InputError
-
-if TYPE_CHECKING:
-    from edge_se_sampler.bench.runner import Experiment, Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +23,6 @@ class BenchSchedule(ExperimentCommand):
 
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.paper import trials as paper
-        from edge_se_sampler.bench.runner import Experiment
         from edge_se_sampler.bench.schedule import trials as schedule
 
         if not (self.parts and self.length_seeds):

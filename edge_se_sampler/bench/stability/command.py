@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import Experiment, ExperimentCommand
 from edge_se_sampler.errors import check_known
-
-if TYPE_CHECKING:
-    from edge_se_sampler.bench.runner import Experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +22,6 @@ class BenchStability(ExperimentCommand):
     """Of weights, pixels and jitter."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.runner import Experiment
         from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Trial
         from edge_se_sampler.bench.stability.train import TrainingSize, run_trial
 
