@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from edge_se_sampler.bench.baselines import run as run_module
-from edge_se_sampler.bench.baselines.results import BaselineSettings, read_baselines
-from edge_se_sampler.bench.baselines.run import Clock, TimeIsUp, mean_psnr, train
+from edge_se_sampler.bench.baselines.run import BaselineSettings, Clock, TimeIsUp, mean_psnr, read_baselines, train
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.errors import InputError

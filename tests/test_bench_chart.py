@@ -52,7 +52,7 @@ def test_a_variant_is_its_method_with_its_changes(name: str, data: Path, tmp_pat
 def test_trainings_that_are_compared_are_neighbors(tmp_path: Path) -> None:
     chart = BenchChart(output_dir=tmp_path, variants=("lean", "edge"), scenes=("mic", "chair"), seeds=(0, 1))
     trials = chart.experiment().trials([])
-    assert [trial.name for trial in trials][:3] == ["lean-mic-0", "edge-mic-0", "lean-chair-0"]
+    assert trials[:3] == [Trial("lean", "mic", 0), Trial("edge", "mic", 0), Trial("lean", "chair", 0)]
     assert len(BenchChart(output_dir=tmp_path, seeds=(0,)).experiment().trials([])) == len(VARIANTS)
 
 
@@ -227,7 +227,7 @@ def test_the_command_writes_a_report_and_goes_on(data: Path, tmp_path: Path, edg
     assert result["errors"] == []
     assert result["settings"] == {"seconds": 2, "threads": 1, "image_size": 24}
     answer = edge_se("bench", "chart", *options, "--variants", "lean", "--dry-run")
-    assert answer.out.splitlines() == ["lean-mic-0", "1 trainings, 0 of them pending"]
+    assert answer.out.splitlines() == ["lean | mic | 0", "1 trainings, 0 of them pending"]
 
 
 def test_bad_flags_are_refused(data: Path, tmp_path: Path, edge_se: Any) -> None:

@@ -13,7 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench import runner
+from edge_se_sampler.bench import command, runner
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, published
 from edge_se_sampler.bench.paper.report import psnr_table
@@ -36,7 +36,7 @@ SMALL = Settings("tiny", iterations=4, info_iterations=3, rays=16, image_size=16
 
 def test_the_paper_has_168_trials_a_seed() -> None:
     trials = list_trials(tuple(PAPER_TABLES), (), (), (0, 1, 2))
-    assert len(trials) == len({trial.name for trial in trials}) == 3 * 168
+    assert len(trials) == len({*trials}) == 3 * 168
     assert [trial.seed for trial in trials] == [0] * 168 + [1] * 168 + [2] * 168
     assert list_trials((), (), (), (0, 1, 2))[: 3 * 168] == trials  # before those of our tables
     assert list_trials((3,), ("mic",), ("edge-nerf",), (7,)) == [Trial(3, "mic", "edge-nerf", 7)]
@@ -167,7 +167,7 @@ def test_every_scene_counts_alike_in_the_mean() -> None:
 def small_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings of a few steps, in threads of this process."""
     monkeypatch.setattr(paper, "Settings", lambda: SMALL)
-    monkeypatch.setattr(runner, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(command, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
 
 
 @pytest.mark.usefixtures("small_settings")
@@ -206,7 +206,7 @@ def test_a_dry_run_trains_and_writes_nothing(tmp_path: Path, edge_se: Callable[.
     answer = edge_se("bench", "paper", "--output-dir", tmp_path / "o", "--tables", 1, 4, "--dry-run")
     assert answer.code == 0, answer
     lines = answer.out.splitlines()
-    assert (lines[0], lines[-1]) == ("table-1-chair-vanilla-nerf-0", "252 trainings, 252 of them pending")
+    assert (lines[0], lines[-1]) == ("1 | chair | vanilla-nerf | 0", "252 trainings, 252 of them pending")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -17,8 +17,14 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench.command import Experiment, Run
-from edge_se_sampler.bench.runner import executor_factory, list_trials, run_experiment, run_in_subprocess
+from edge_se_sampler.bench.runner import (
+    Experiment,
+    Run,
+    executor_factory,
+    list_trials,
+    run_experiment,
+    run_in_subprocess,
+)
 from edge_se_sampler.errors import InputError
 
 
@@ -31,10 +37,6 @@ class ToySettings:
 class ToyTrial:
     scene: str
     seed: int
-
-    @property
-    def name(self) -> str:
-        return f"{self.scene}-{self.seed}"
 
 
 TRIALS = [ToyTrial("mic", seed) for seed in range(3)]
@@ -152,7 +154,7 @@ def test_listing_trials_trains_and_writes_nothing(tmp_path: Path, capsys: pytest
     run_experiment(toy_experiment(trials=lambda _: TRIALS[:1]), tmp_path, one_thread)
     before = (tmp_path / "result.json").read_bytes()
     list_trials(toy_experiment(lambda _: pytest.fail("trained")), tmp_path)
-    assert capsys.readouterr().out.endswith("mic-0\nmic-1\nmic-2\n3 trainings, 2 of them pending\n")
+    assert capsys.readouterr().out.endswith("mic | 0\nmic | 1\nmic | 2\n3 trainings, 2 of them pending\n")
     assert (tmp_path / "result.json").read_bytes() == before
     list_trials(toy_experiment(), tmp_path / "new")
     assert not (tmp_path / "new").exists()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from edge_se_sampler.bench import runner
+from edge_se_sampler.bench import command
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.schedule import trials as schedule
 from edge_se_sampler.bench.schedule.report import compare_lengths, describe, pair_failures
@@ -118,7 +118,7 @@ def test_the_command_trains_in_stages_what_is_pending(
 ) -> None:
     small = paper.Settings("tiny", iterations=4, info_iterations=3, rays=8, image_size=16, num_train=11, num_test=1)
     monkeypatch.setattr(paper, "Settings", lambda: small)
-    monkeypatch.setattr(runner, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(command, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(schedule, "SCENES", ("mic",))
     monkeypatch.setattr(schedule, "CONFIGURATIONS", (2, 6))
     monkeypatch.setattr(schedule, "LENGTHS", (3, 4))

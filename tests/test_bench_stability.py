@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_se_sampler.bench import runner
+from edge_se_sampler.bench import command
 from edge_se_sampler.bench.outcomes import Outcome
 from edge_se_sampler.bench.stability import report, scenes
 from edge_se_sampler.bench.stability import train as train_module
@@ -212,7 +212,7 @@ def test_the_command_trains_and_reports_a_small_sweep(
     tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train_module, "TrainingSize", lambda: SMALL)
-    monkeypatch.setattr(runner, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(command, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
     out = tmp_path / "new" / "out"
     flags = ["--settings", "base", "off centre", "--strategies", "vanilla-nerf", "adaptive", "--seeds", 0]
     answer = edge_se("bench", "stability", "--output-dir", out, "--workplace", tmp_path / "w", *flags)

@@ -1,40 +1,19 @@
-"""What an experiment is, and what the commands of all experiments have in common. Torch-free until one runs.
-
-trial   what identifies a training: a frozen dataclass of plain values, with a `name`
-run     a trial's fields and what was measured
-"""
+"""What the commands of all experiments have in common. Torch-free until one runs."""
 
 from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
+from edge_se_sampler.bench.report import write_report
+from edge_se_sampler.bench.runner import Experiment, executor_factory, list_trials, run_experiment
+from edge_se_sampler.bench.statistics import require_scipy_stats
+from edge_se_sampler.engine.figures import require_pyplot
 from edge_se_sampler.errors import check_value
-
-Run = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """What is trained, and how large."""
-
-    name: str
-    """As in `edge-se bench NAME`; the report is chosen by it."""
-    settings: Any
-    """A dataclass of plain values; a result.json of other settings is refused."""
-    trials: Callable[[list[Run]], Sequence[Any]]
-    """Runs so far -> the trials to train. Called again until none is pending, so that later trials may depend on
-    earlier results."""
-    train: Callable[..., Run]
-    """(trial, *arguments(trial)) -> its run; called in another process, so a function of a module."""
-    arguments: Callable[[Any], tuple[Any, ...]]
-    """Trial -> further arguments of `train`, for instance the scene's folder; called in this process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +40,6 @@ class ExperimentCommand(ABC):
 
     def run(self) -> None:
         """Train and report; InputError as `experiment`, `run_experiment` and `write_report`."""
-        from edge_se_sampler.bench.report import write_report
-        from edge_se_sampler.bench.runner import executor_factory, list_trials, run_experiment
-        from edge_se_sampler.bench.statistics import require_scipy_stats
-        from edge_se_sampler.engine.figures import require_pyplot
-
         check_value("seeds", "empty", bool(self.seeds), "at least one number")
         check_value("workers", self.workers, self.workers is None or self.workers > 0, "at least 1")
         experiment = self.experiment()

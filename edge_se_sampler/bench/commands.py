@@ -12,6 +12,7 @@ from edge_se_sampler.bench.chart.command import BenchChart
 from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring
 from edge_se_sampler.bench.nerfstudio.command import BenchNerfstudio
 from edge_se_sampler.bench.paper.command import BenchPaper
+from edge_se_sampler.bench.report import write_report
 from edge_se_sampler.bench.schedule.command import BenchSchedule
 from edge_se_sampler.bench.stability.command import BenchStability
 
@@ -28,8 +29,6 @@ class BenchReport:
     """Where the experiment left renderings; pictures of them are drawn again only if they are there."""
 
     def run(self) -> None:
-        from edge_se_sampler.bench.report import write_report
-
         write_report(self.folder, self.readme, self.workplace)
         print(f"wrote {self.folder / 'README.md'}")
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy
-import torch
 
 from edge_se_sampler import __version__
 from edge_se_sampler.engine.progress import Progress
@@ -20,6 +19,8 @@ from edge_se_sampler.engine.progress import Progress
 
 def machine() -> dict[str, Any]:
     """Versions and hardware, for the json of every result."""
+    import torch
+
     return {
         "edge_se_sampler": __version__,
         "python": platform.python_version(),

@@ -1,6 +1,9 @@
 """Many trainings in parallel processes, kept in one result.json: every finished one stays, a later call goes on.
 
-Trial, run and experiment: see `bench.command`.
+trial   what identifies a training: a frozen dataclass of plain values
+run     a trial's fields and what was measured
+
+Free of torch until a result is created.
 """
 
 from __future__ import annotations
@@ -14,11 +17,10 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.command import Experiment, Run
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.engine.files import make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
@@ -28,15 +30,33 @@ VERSION = 2
 MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
+Run = dict[str, Any]
 ExecutorFactory = Callable[[], Executor]
 
 
+@dataclass(frozen=True)
+class Experiment:
+    """What is trained, and how large."""
+
+    name: str
+    """As in `edge-se bench NAME`; the report is chosen by it."""
+    settings: Any
+    """A dataclass of plain values; a result.json of other settings is refused."""
+    trials: Callable[[list[Run]], Sequence[Any]]
+    """Runs so far -> the trials to train. Called again until none is pending, so that later trials may depend on
+    earlier results."""
+    train: Callable[..., Run]
+    """(trial, *arguments(trial)) -> its run; called in another process, so a function of a module."""
+    arguments: Callable[[Any], tuple[Any, ...]]
+    """Trial -> further arguments of `train`, for instance the scene's folder; called in this process."""
+
+
 def list_trials(experiment: Experiment, output_dir: Path) -> None:
-    """Print the names of the trials that are known yet, and how many of them are pending."""
+    """Print the trials that are known yet, and how many of them are pending."""
     result = load_or_create(output_dir / "result.json", experiment.name, experiment.settings)
     trials = experiment.trials(result["runs"])
     for trial in trials:
-        print(trial.name)
+        print(*asdict(trial).values(), sep=" | ")
     print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from edge_se_sampler.bench.chart.command import ChartOptions
+from edge_se_sampler.bench.runner import load_or_create, run_in_subprocess, write_result
+from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.errors import InputError
 
 ProgramName = Literal["nerf-pytorch", "tensorf", "nerfstudio-vanilla-nerf", "nerfstudio-nerfacto"]
@@ -33,10 +35,7 @@ class BenchBaselines(ChartOptions):
     def run(self) -> None:
         """Train one after the other; what has ended is kept. InputError: the program is not there, refuses its flags or
         ends too soon, or the json is of other settings."""
-        from edge_se_sampler.bench.baselines.results import BaselineSettings
-        from edge_se_sampler.bench.baselines.run import train, version_of
-        from edge_se_sampler.bench.runner import load_or_create, run_in_subprocess, write_result
-        from edge_se_sampler.engine.files import make_folder
+        from edge_se_sampler.bench.baselines.run import BaselineSettings, train, version_of
 
         settings = BaselineSettings(
             **vars(self.settings()), program=self.program, label=self.label, flags=self.flags,

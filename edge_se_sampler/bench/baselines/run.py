@@ -2,7 +2,8 @@
 
 A program is imported from a checkout of its own, or from this environment. Its training loop calls the clock after
 every step (in the place of its evaluation, which it then calls each time, or as a callback). The clock starts when
-the program begins to read the data, as it does for our trainings.
+the program begins to read the data, as it does for our trainings. Results are shown beside ours: DIR/baselines/*.json
+of a chart's folder DIR; a run has scene, seed and curve, rows of training seconds and mean PSNR of the test views.
 """
 # pyright: reportMissingImports=false
 # no environment that is linted has the programs
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -27,9 +29,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.baselines.results import BaselineSettings
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
@@ -37,6 +38,38 @@ from edge_se_sampler.errors import InputError
 
 BASELINE_EVAL_SECONDS = EVAL_SECONDS[1::3]
 """Fewer than ours: some programs take minutes to render the test views."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineSettings(ChartSettings):
+    """What was run, and how: the flags of `edge-se bench baselines`."""
+
+    program: str
+    label: str = ""
+    program_version: str
+    flags: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.program}, {self.label}" if self.label else self.program
+
+
+def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str, Any]]:
+    """Name and version -> result of the baselines in a chart's folder, in the order of their file names. InputError: a
+    file cannot be read, or is of another number of threads or size of images."""
+    baselines = {}
+    for path in sorted((folder / "baselines").glob("*.json")):
+        result = read_result(path)
+        try:
+            found = BaselineSettings(**result["settings"])
+        except TypeError as problem:
+            raise InputError(f"{path}: not a result of edge-se bench baselines ({problem!r})") from problem
+        for key in ("threads", "image_size"):
+            value, expected = getattr(found, key), getattr(settings, key)
+            if value != expected:
+                raise InputError(f"{path}: {key} is {value}, the chart's is {expected}: seconds cannot be compared")
+        baselines[f"{found.name} ({found.program_version})"] = result
+    return baselines
 
 
 class TimeIsUp(BaseException):

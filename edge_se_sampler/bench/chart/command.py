@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_se_sampler.bench.chart.variants import VARIANTS
-from edge_se_sampler.bench.command import Experiment, ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.runner import Experiment, run_in_subprocess
 from edge_se_sampler.errors import InputError, check_known, check_value
 
 if TYPE_CHECKING:
@@ -68,9 +69,8 @@ class BenchChart(ChartOptions, ExperimentCommand):
     """Which; none: all. --dry-run lists their names."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.baselines.results import read_baselines
+        from edge_se_sampler.bench.baselines.run import read_baselines
         from edge_se_sampler.bench.chart.trials import Trial, train_and_evaluate
-        from edge_se_sampler.bench.runner import run_in_subprocess
 
         check_known("variants", self.variants, VARIANTS)
         settings = self.settings()

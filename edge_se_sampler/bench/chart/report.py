@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.baselines.results import read_baselines
+from edge_se_sampler.bench.baselines.run import read_baselines
 from edge_se_sampler.bench.chart.figures import draw_chart, draw_scenes
 from edge_se_sampler.bench.chart.summary import (
     END,
@@ -21,9 +21,8 @@ from edge_se_sampler.bench.chart.summary import (
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
-from edge_se_sampler.bench.report import fill_template
+from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.bench.tables import decimals, describe_command, markdown_table
 from edge_se_sampler.engine.figures import save_figure
 
 COLUMNS = {3: "3 s", 7: "7 s", 20: "20 s", 60: "60 s", END: "end"}  # moments -> heads, if trainings are so long

@@ -64,10 +64,6 @@ class Trial:
     scene: str
     seed: int
 
-    @property
-    def name(self) -> str:
-        return f"{self.variant}-{self.scene}-{self.seed}"
-
 
 def config_of(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
     """What a trial trains; its number of iterations is still open."""

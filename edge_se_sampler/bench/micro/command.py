@@ -7,6 +7,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from edge_se_sampler.bench.report import write_report
+from edge_se_sampler.bench.runner import new_result
+from edge_se_sampler.engine.files import make_folder, write_json
 from edge_se_sampler.errors import check_value
 
 
@@ -23,9 +26,6 @@ class MicroBenchmark:
 
     def run(self) -> None:
         """Measure and report; InputError if a flag's value has no meaning, or a file cannot be written."""
-        from edge_se_sampler.bench.report import write_report
-        from edge_se_sampler.bench.runner import new_result
-        from edge_se_sampler.engine.files import make_folder, write_json
 
         flags = {key: value for key, value in asdict(self).items() if key != "output_dir"}
         settings = {key: value for key, value in flags.items() if not isinstance(value, Path)}

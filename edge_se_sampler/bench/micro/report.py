@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.report import fill_template
-from edge_se_sampler.bench.tables import describe_machine, markdown_table
+from edge_se_sampler.bench.report import describe_machine, fill_template, markdown_table
 
 SAMPLER_LABELS = {
     "edge_all_images": "Edge, of all images",

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from edge_se_sampler.bench.nerfstudio.train import METHODS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
-from edge_se_sampler.bench.report import fill_template
+from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import read_result
-from edge_se_sampler.bench.tables import describe_command, markdown_table
 
 
 def describe(folder: Path) -> str:

@@ -48,10 +48,6 @@ class Trial:
     method: str
     seed: int
 
-    @property
-    def name(self) -> str:
-        return f"{self.method}, seed {self.seed}"
-
 
 def render_scene(workplace: Path) -> Path:
     return cached_scene(workplace, TrainingSettings.scene, **SCENE_OPTIONS)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edge_se_sampler.bench.command import Experiment, ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.runner import Experiment
 from edge_se_sampler.errors import InputError, check_known
 
 

@@ -11,10 +11,9 @@ from edge_se_sampler.bench.paper.figures import draw_figures
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, published
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, TABLES
 from edge_se_sampler.bench.paper.verdicts import MIN_DIFFERENCE, ClaimVerdict, evaluate_claims
-from edge_se_sampler.bench.report import fill_template
+from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.statistics import format_difference
-from edge_se_sampler.bench.tables import decimals, describe_command, markdown_table
 
 OTHER_CURES = {
     "Xavier weights, ReLU density": (1, 2),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from edge_se_sampler.bench.command import Experiment, ExperimentCommand, Run
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.runner import Experiment, Run
 from edge_se_sampler.errors import InputError
 
 

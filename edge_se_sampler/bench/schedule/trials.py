@@ -46,11 +46,6 @@ class Trial:
     arm: str
     seed: int
 
-    @property
-    def name(self) -> str:
-        """Of its run folder."""
-        return "-".join(map(str, asdict(self).values()))
-
 
 def list_failure_trials(settings: Settings, seeds: Sequence[int]) -> list[Trial]:
     """Random and the adaptive schedule in 28 configurations, paired seed by seed."""
@@ -103,7 +98,7 @@ def build_config(trial: Trial, data: Path, output_dir: Path) -> TrainerConfig:
     strategy = "vanilla-nerf" if trial.arm == "random" else "edge-se-nerf"
     settings = replace(paper.Settings(), iterations=trial.iterations)
     paper_trial = paper.Trial(trial.table, trial.scene, strategy, trial.seed)
-    changes: dict[str, Any] = {"experiment_name": trial.name}
+    changes: dict[str, Any] = {"experiment_name": "-".join(map(str, asdict(trial).values()))}
     if trial.arm == "adaptive":
         changes |= {f"{SAMPLER}.schedule": "adaptive", "reinit_dead": True}
     elif trial.arm != "random":

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 
-from edge_se_sampler.bench.command import Experiment, ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.runner import Experiment
 from edge_se_sampler.errors import check_known
 
 
@@ -15,7 +16,7 @@ class BenchStability(ExperimentCommand):
     initial weights, ...). Resumes."""
 
     settings: tuple[str, ...] = ()
-    """By the names of --dry-run, e.g. "off centre, 10 views"; none: all 24."""
+    """By the labels that --dry-run lists, e.g. "off centre, 10 views"; none: all 24."""
     strategies: tuple[str, ...] = ()
     """The paper's six by method, reinit and adaptive; none: all."""
     seeds: tuple[int, ...] = tuple(range(10))

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN
-from edge_se_sampler.bench.report import fill_template
+from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
-from edge_se_sampler.bench.tables import describe_command, markdown_table
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 
 FAILURE_MODES = {

@@ -88,7 +88,3 @@ class Trial:
     strategy: str
     """Name in `STRATEGIES`."""
     seed: int
-
-    @property
-    def name(self) -> str:
-        return f"{self.setting}: {self.strategy}, seed {self.seed}"
