@@ -41,7 +41,7 @@ class MicroBenchmark:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchSamplers(MicroBenchmark):
-    """Time building probability tables, drawing and selecting pixels; compare training memory of SE with Random's."""
+    """Time building probability tables, drawing and selecting pixels."""
 
     name: ClassVar[str] = "samplers"
     file_name: ClassVar[str] = "samplers.json"

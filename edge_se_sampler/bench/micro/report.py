@@ -29,11 +29,10 @@ def describe(folder: Path) -> str:
     results = [result for result in results if result.get("experiment") == "micro"]
     parts: dict[str, Any] = {result["benchmark"]: result for result in results}
     if "samplers" in parts:
-        settings, memory = parts["samplers"]["settings"], parts["samplers"]["training_memory"]
+        settings = parts["samplers"]["settings"]
         head = (f"{settings['draws']} pixels", f"median of {settings['rounds']} draws")
         times = parts["samplers"]["milliseconds"].items()
         parts["draws"] = markdown_table(head, [(SAMPLER_LABELS[name], f"{value:.2f} ms") for name, value in times])
-        parts["memory_ratio"] = memory["se_bytes"] / memory["random_bytes"]
     if "scoring" in parts:
         scored = [result for result in results if result["benchmark"] == "scoring"]
         parts["scoring"] = "\n\n".join(map(_tabulate_scoring, scored))

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.machine import median_milliseconds
-from edge_se_sampler.bench.micro.samplers import late_phase, training_peak
+from edge_se_sampler.bench.machine import median_milliseconds, resident_memory
+from edge_se_sampler.bench.runner import run_in_subprocess
 from edge_se_sampler.bench.statistics import require_scipy_stats
 from edge_se_sampler.bench.train import cached_scene
-from edge_se_sampler.engine.config import override
+from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, TrainerConfig, override
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.session import prepare
@@ -39,22 +39,27 @@ def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iter
     """
     require_scipy_stats()
     data = cached_scene(workplace, scene)
-    methods = {"random": ("vanilla-nerf", "fine"), **{source: ("se-nerf", source) for source in ERROR_SOURCES}}
     with tempfile.TemporaryDirectory() as folder:
-        base = {"data": data, "output_dir": Path(folder), "machine.device_type": "cpu"}
-
-        def build_trainer(method: str, error_source: str) -> Trainer:
-            return prepare(override(method_configs()[method], base | late_phase(rays, size, error_source)))
-
-        trainers = {name: build_trainer(*method) for name, method in methods.items()}
+        changes = {
+            "data": data,
+            "output_dir": Path(folder),
+            "machine.device_type": "cpu",
+            f"{SAMPLER}.early_fraction": 0.0,
+            f"{MANAGER}.train_num_rays_per_batch": rays,
+            f"{MODEL}.size": size,
+        }
+        configs = {"random": override(method_configs()["vanilla-nerf"], changes)}
+        for source in ERROR_SOURCES:
+            configs[source] = override(method_configs()["se-nerf"], changes | {f"{SAMPLER}.error_source": source})
+        trainers = {name: prepare(config) for name, config in configs.items()}
         milliseconds = median_milliseconds({name: each.train_iteration for name, each in trainers.items()}, rounds)
-        trainer = build_trainer(*methods["cached"])
+        trainer = prepare(configs["cached"])
         with Progress(iterations, "training") as progress:
             for step in range(iterations):
                 trainer.train_iteration(step)
                 progress.update(step + 1)
         correlations = correlate_rankings(trainer, iterations)
-    peaks = {name: training_peak(method, rays, size, source) for name, (method, source) in methods.items()}
+        peaks = {name: run_in_subprocess(training_peak, config) for name, config in configs.items()}
     memory = {source: peaks[source] / peaks["random"] for source in ERROR_SOURCES}
     return {"milliseconds": milliseconds, "memory_against_random": memory, "rank_correlation": correlations}
 
@@ -76,3 +81,12 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
     cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)
     spearman = require_scipy_stats().spearmanr
     return {"coarse": float(spearman(fine, coarse).statistic), "cached": float(spearman(fine, cached).statistic)}
+
+
+def training_peak(config: TrainerConfig) -> int:
+    """Resident bytes of a few steps, above the level after imports; to be called in a fresh process."""
+    before = resident_memory()
+    trainer = prepare(config)
+    for step in range(3):
+        trainer.train_iteration(step)
+    return resident_memory("VmHWM") - before
