@@ -21,7 +21,8 @@ class BenchNerfstudio(ExperimentCommand):
         from importlib.metadata import version
         from importlib.util import find_spec
 
-        from edge_se_sampler.bench.nerfstudio.train import METHODS, TrainingSettings, Trial, render_scene, run_trial
+        from edge_se_sampler.bench.nerfstudio.train import METHODS, SCENE_OPTIONS, TrainingSettings, Trial, run_trial
+        from edge_se_sampler.bench.train import cached_scene
 
         if find_spec("nerfstudio") is None or find_spec("torchvision") is None:
             raise InputError("bench nerfstudio needs all of nerfstudio 1.1.5 beside edge_se_sampler in one environment")
@@ -29,7 +30,7 @@ class BenchNerfstudio(ExperimentCommand):
         trials = [Trial(method, seed) for seed in self.seeds for method in METHODS]
 
         def arguments(_: Trial) -> tuple[object, ...]:
-            return settings, render_scene(self.workplace), self.workplace
+            return settings, cached_scene(self.workplace, settings.scene, **SCENE_OPTIONS), self.workplace
 
         return Experiment("nerfstudio", settings, lambda _: trials, run_trial, arguments)
 

@@ -9,14 +9,12 @@ import contextlib
 import statistics
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
 from edge_se_sampler.bench.outcomes import measure_outcome
-from edge_se_sampler.bench.train import cached_scene
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import to_pictures
@@ -49,17 +47,14 @@ class Trial:
     seed: int
 
 
-def render_scene(workplace: Path) -> Path:
-    return cached_scene(workplace, TrainingSettings.scene, **SCENE_OPTIONS)
-
-
 def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: Path) -> dict[str, Any]:
     """Train once and measure the test views: seconds, cpu_seconds, psnr, and those of `measure_outcome`."""
     config = build_config(trial.method, trial.seed, data, workplace / "runs")
     config.max_num_iterations = settings.iterations
     config.pipeline.datamanager.train_num_rays_per_batch = settings.rays
     config.pipeline.model.num_coarse_samples = config.pipeline.model.num_importance_samples = settings.samples
-    with _silent(workplace):
+    with open(workplace / "nerfstudio.log", "a") as log, contextlib.redirect_stdout(log), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         trainer = build_trainer(config, "test")
         start, cpu_start = time.monotonic(), time.process_time()
         trainer.train()
@@ -70,11 +65,3 @@ def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: P
     psnr = statistics.mean(image["psnr"] or 0.0 for image in images)
     outcome = measure_outcome({"psnr": psnr, "images": images}, pictures, 1.0)
     return {"seconds": seconds, "cpu_seconds": cpu_seconds, "psnr": psnr, **outcome}
-
-
-@contextlib.contextmanager
-def _silent(workplace: Path) -> Iterator[None]:
-    """What nerfstudio prints goes to a log in the workplace; its warnings go nowhere."""
-    with open(workplace / "nerfstudio.log", "a") as log, contextlib.redirect_stdout(log), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
