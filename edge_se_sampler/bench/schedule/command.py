@@ -12,8 +12,8 @@ from edge_se_sampler.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class BenchSchedule(ExperimentCommand):
-    """Test the adaptive schedule: failures, paired with Random's, and PSNR against the best fixed early phase. Writes
-    result.json, README.md and lengths.png; resumes."""
+    """Test the adaptive schedule: failures, paired with Random's, and PSNR against the best fixed early phase.
+    Resumes."""
 
     parts: tuple[Literal["failures", "lengths"], ...] = ("failures", "lengths")
     """Which of the two tests."""
