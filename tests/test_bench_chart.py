@@ -192,6 +192,14 @@ def test_every_scene_has_its_column_and_failures_are_bracketed(tmp_path: Path) -
     assert "| SE |" not in text
 
 
+def test_a_single_variant_has_a_page_of_its_own(tmp_path: Path) -> None:
+    runs = [run_of("lean", scene, seed, [(1, 20), (9, 30)]) for scene in ("chair", "mic") for seed in range(3)]
+    text = describe(folder_of(tmp_path, runs))
+    assert text.startswith("# 3 seeds of lean-nerf\n")
+    assert row_of(text.split("## Every scene")[0], "lean-nerf")[:4] == ["25.00", "28.86", "30.00", "0 of 6"]
+    assert "## Methods" not in text
+
+
 def test_pictures_are_drawn_where_there_is_something_to_compare(tmp_path: Path) -> None:
     folder = folder_of(tmp_path, [run_of("no-hull", "mic", 0, [(1, 20)])])
     draw(folder, None)

@@ -58,15 +58,14 @@ def _fill_markers(path: Path, tables: Mapping[str, str]) -> None:
     write_atomically(path, text.encode())
 
 
-def fill_template(module_file: str, folder: Path, /, **parts: object) -> str:
-    """The report.md beside a module, its {placeholders} filled in by `str.format`.
+def fill_template(module_file: str, folder: Path, template: str = "report.md", /, **parts: object) -> str:
+    """A template beside a module, its {placeholders} filled in by `str.format`.
 
     Left out are sections, from a `##` heading to the next, that have placeholders of which none has a value, and
     paragraphs that begin with a picture, `![...](NAME.png)`, which does not lie in the folder.
     """
-    template = Path(module_file).with_name("report.md").read_text(encoding="utf-8")
     text = ""
-    for section in re.split(r"(?m)^(?=##+ )", template):
+    for section in re.split(r"(?m)^(?=##+ )", Path(module_file).with_name(template).read_text(encoding="utf-8")):
         names = [re.split(r"[.[]", name)[0] for _, name, _, _ in Formatter().parse(section) if name]
         if not (text and names) or any(parts.get(name, "") != "" for name in names):
             text += section.format(**parts)

@@ -10,14 +10,7 @@ from typing import Any
 
 from edge_se_sampler.bench.baselines.run import read_baselines
 from edge_se_sampler.bench.chart.figures import draw_chart, draw_scenes
-from edge_se_sampler.bench.chart.summary import (
-    END,
-    by_variant,
-    comparable,
-    mean_psnr_at,
-    runs_on,
-    scenes_of,
-)
+from edge_se_sampler.bench.chart.summary import END, by_variant, comparable, mean_psnr_at, runs_on, scenes_of
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
@@ -40,17 +33,23 @@ def draw(folder: Path, workplace: Path | None) -> None:
 
 
 def describe(folder: Path) -> str:
-    """The README.md; notes.md has remarks by hand, which no number of the result shows."""
+    """The README.md, of a single variant one of its own; notes.md has remarks by hand, which no number shows."""
     result, baselines, baseline_results = _read(folder)
     runs, settings, notes = result["runs"], ChartSettings(**result["settings"]), folder / "notes.md"
+    groups = {group: _describe_group(runs, group, baselines) for group in GROUPS}
+    variants = {run["variant"] for run in runs}
     return fill_template(
         __file__,
         folder,
+        "one_variant.md" if len(variants) == 1 and not baselines else "report.md",
         **result["settings"],
+        **groups,
         unit=settings.unit,
         number=len(runs),
+        seeds=len({run["seed"] for run in runs}),
+        variant=", ".join(VARIANTS[name].full_label for name in variants),
+        table="".join(groups.values()),
         failure_rule=FAILURE_RULE,
-        **{group: _describe_group(runs, group, baselines) for group in GROUPS},
         every_scene=_compare_scenes(runs, baselines),
         notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
         reproduce=describe_command(*baseline_results, result),
@@ -60,7 +59,7 @@ def describe(folder: Path) -> str:
 def tables(folder: Path) -> dict[str, str]:
     """methods: PSNR of methods and baselines after some seconds and at the end, and failures."""
     result, baselines, _ = _read(folder)
-    return {"methods": _group_table(result["runs"], "methods", baselines, costs=False)}
+    return {"methods": _group_table(result["runs"], "methods", baselines, costs=False)[1]}
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], Baselines, Iterable[dict[str, Any]]]:
@@ -70,38 +69,31 @@ def _read(folder: Path) -> tuple[dict[str, Any], Baselines, Iterable[dict[str, A
     return result, {label: baseline["runs"] for label, baseline in baselines.items()}, baselines.values()
 
 
-def _comparable_with_group(runs: list[Run], group: str) -> dict[str, list[Run]]:
-    return comparable(by_variant(runs, TOP if group in TOP else [group]))
-
-
-def _list_scenes(compared: Mapping[str, list[Run]]) -> str:
-    return ", ".join(scenes_of(chain(*compared.values()))) or "no scene and seed that all have"
-
-
 def _describe_group(runs: list[Run], group: str, baselines: Baselines) -> str:
     """A group's table, and on which scenes it compares; empty if none of the group was trained."""
     if not any(VARIANTS[run["variant"]].group == group for run in runs):
         return ""
-    return f"On {_list_scenes(_comparable_with_group(runs, group))}:\n\n{_group_table(runs, group, baselines)}"
+    scenes, table = _group_table(runs, group, baselines)
+    return f"On {', '.join(scenes) or 'no scene and seed that all have'}:\n\n{table}"
 
 
-def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool = True) -> str:
-    """A group's variants, and baselines beside methods: PSNR, failures and costs."""
-    compared = _comparable_with_group(runs, group)
+def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool = True) -> tuple[list[str], str]:
+    """The scenes that a group is compared on, and its variants, and baselines beside methods: PSNR, failures, costs."""
+    compared = comparable(by_variant(runs, TOP if group in TOP else [group]))
+    scenes = scenes_of(chain(*compared.values()))
     longest = max((run["seconds"] for run in runs), default=0.0)
     moments = [seconds for seconds in COLUMNS if seconds == END or 1.05 * seconds < longest]
     shown = {
         VARIANTS[n].label: found for n, found in compared.items() if VARIANTS[n].group == group or n == RECOMMENDED
     }
     if group == "methods":
-        scenes = scenes_of(chain(*compared.values()))
         shown |= {label: found for label, all_runs in baselines.items() if (found := runs_on(all_runs, scenes))}
     rows = []
     for label, found in shown.items():
         psnr = [decimals(mean_psnr_at(found, seconds)) for seconds in moments]
         rows.append([label, *psnr, _failures(found), *(_cost_fields(found) if costs else ())])
     head = ["", *(COLUMNS[seconds] for seconds in moments), "failed"]
-    return markdown_table([*head, *(("ms a step", "queries a step", "memory") if costs else ())], rows)
+    return scenes, markdown_table([*head, *(("ms a step", "queries a step", "memory") if costs else ())], rows)
 
 
 def _compare_scenes(runs: list[Run], baselines: Baselines) -> str:
