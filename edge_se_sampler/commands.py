@@ -197,6 +197,8 @@ class Inspect:
     """A Blender folder."""
     output_path: Path = Path("inspect.png")
     """The picture to write."""
+    downscale: int = 1
+    """Average every DOWNSCALE x DOWNSCALE pixels first, as in training."""
     near: float = LeanModelConfig.near
     """Depth along the optical axis at which samples begin, world units."""
     far: float = LeanModelConfig.far
@@ -208,14 +210,17 @@ class Inspect:
 
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender
+        from edge_se_sampler.data.downscale import downscale
         from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.engine.inspection import inspect
 
+        check_value("downscale", self.downscale, self.downscale >= 1, "at least 1")
         check_output(self.output_path)
         config = LeanModelConfig(
             near=self.near, far=self.far, voxel_size_px=self.voxel_size_px, step_size_voxels=self.step_size_voxels
         )
-        print(inspect(read_blender(self.data, "train"), config, self.output_path))
+        views = downscale(read_blender(self.data, "train"), self.downscale)
+        print(inspect(views, config, self.output_path))
         print(self.output_path)
 
 

@@ -74,6 +74,12 @@ class Cameras:
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         return Cameras(**{k: v.to(device, dtype if v.is_floating_point() else None) for k, v in vars(self).items()})
 
+    def downscale(self, factor: int) -> Cameras:
+        """The cameras of images in which every factor x factor pixels have become one; what is left over at the right
+        and lower border is cut off."""
+        intrinsics = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, **intrinsics, width=self.width // factor, height=self.height // factor)
+
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
         """A ray through each of coords (n, 2), float y, x in pixels, of the cameras (n, 1) int64."""
         c = camera_indices[:, 0]

@@ -61,6 +61,8 @@ class TrainerConfig(InstantiateConfig):
     """Train on this many of the views, selected as InfoNeRF's code does; by default on all."""
     views: tuple[int, ...] | None = None
     """Indices (from 0) of the views to train on, instead of --num-views."""
+    downscale: int = 1
+    """Average every DOWNSCALE x DOWNSCALE pixels of all images, held-out ones too, and train on these."""
     output_dir: Path = Path("outputs")
     """Runs are written to OUTPUT_DIR/EXPERIMENT/METHOD/TIMESTAMP."""
     experiment_name: str | None = None
@@ -98,6 +100,7 @@ class TrainerConfig(InstantiateConfig):
         manager, model, optimizer = self.pipeline.datamanager, self.pipeline.model, self.optimizer
         at_least_one = {
             "max-num-iterations": self.max_num_iterations,
+            "downscale": self.downscale,
             "steps-per-save": self.steps_per_save,
             "steps-per-eval-image": self.steps_per_eval_image,
             "steps-per-log": self.steps_per_log,

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.blender import Split, has_split, read_blender
+from edge_se_sampler.data.downscale import downscale
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
@@ -94,16 +95,18 @@ def read_test_views(config: TrainerConfig) -> Views:
 def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views | None:
     assert config.data is not None
     found = (read_blender(config.data, split) for split in splits if has_split(config.data, split))
-    return next((views for views in found if views.names), None)
+    views = next((views for views in found if views.names), None)
+    return None if views is None else downscale(views, config.downscale)
 
 
 def read_train_views(config: TrainerConfig) -> Views:
     """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
     if config.data is None:
         raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
+    check_value("downscale", config.downscale, config.downscale >= 1, "at least 1")
     views = read_blender(config.data, "train")
     selected = select_views(config, len(views.names))
-    return views if selected is None else views.subset(selected)
+    return downscale(views if selected is None else views.subset(selected), config.downscale)
 
 
 def select_views(config: TrainerConfig, count: int) -> list[int] | None:
