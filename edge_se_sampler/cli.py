@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import make_dataclass
 from typing import Annotated, Any, NoReturn, Union
 
 import tyro
@@ -59,14 +60,14 @@ def _run(arguments: list[str]) -> None:
             {name: method.config for name, method in methods.items()},
             {name: method.description for name, method in methods.items()},
         )
-        config = _parse(configs, arguments[1:], "edge-se train")
+        config = _parse(_subcommands(COMMANDS | {"train": _nested(configs)}), arguments).chosen
         from edge_se_sampler.engine.session import prepare
 
         train(prepare(config))
     elif arguments[:1] == ["bench"]:
-        _parse(_subcommands(BENCHES), arguments[1:], "edge-se bench").run()
+        _parse(_subcommands(COMMANDS | {"bench": _nested(_subcommands(BENCHES))}), arguments).chosen.run()
     else:
-        _parse(_subcommands(COMMANDS), arguments, "edge-se").run()
+        _parse(_subcommands(COMMANDS), arguments).run()
 
 
 def _subcommands(commands: dict[str, type]) -> Any:
@@ -75,8 +76,13 @@ def _subcommands(commands: dict[str, type]) -> Any:
     return Union[kinds]  # noqa: UP007
 
 
-def _parse(kind: Any, arguments: list[str], program: str) -> Any:
-    return tyro.cli(tyro.conf.configure(tyro.conf.FlagConversionOff)(kind), args=arguments, prog=program)
+def _nested(kind: Any) -> type:
+    """A command that has subcommands, as `chosen`: tyro's hints need the whole command line to name them."""
+    return make_dataclass("Nested", [("chosen", Annotated[kind, tyro.conf.arg(name="")])])
+
+
+def _parse(kind: Any, arguments: list[str]) -> Any:
+    return tyro.cli(tyro.conf.configure(tyro.conf.FlagConversionOff)(kind), args=arguments, prog="edge-se")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -159,6 +159,22 @@ class Render(_RunCommand):
 
 
 @dataclass(frozen=True)
+class _ShownSettings:
+    num_rays_per_batch: int = EdgeSEPixelSamplerConfig.num_rays_per_batch
+    """Pixels drawn from each view."""
+    ignore_mask: bool = EdgeSEPixelSamplerConfig.ignore_mask
+    """Draw from masked pixels too."""
+    precrop_fraction: float = EdgeSEPixelSamplerConfig.precrop_fraction
+    """Side of the precrop box as a share of the image's side."""
+    edge_filter: Literal["sobel", "laplacian", "canny"] = EdgeSEPixelSamplerConfig.edge_filter
+    """Edge operator."""
+    edge_source: Literal["color", "alpha", "both"] = EdgeSEPixelSamplerConfig.edge_source
+    """Edges of the color composited on white, of alpha, or the stronger of both."""
+    edge_epsilon: float = EdgeSEPixelSamplerConfig.edge_epsilon
+    """Strength that every pixel has besides its edge."""
+
+
+@dataclass(frozen=True)
 class Show:
     """Picture what a sampler does to your own images: view, probability of every pixel, and the pixels of a batch."""
 
@@ -172,8 +188,8 @@ class Show:
     """Number of training views shown."""
     seed: int = 0
     """Seed of the drawn pixels."""
-    pixel_sampler: EdgeSEPixelSamplerConfig = field(default_factory=EdgeSEPixelSamplerConfig)
-    """Settings of the distribution and the batch; those of phases and errors have no effect here."""
+    pixel_sampler: _ShownSettings = _ShownSettings()
+    """Settings of the distribution and the batch, under their names in training."""
 
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender
@@ -185,7 +201,8 @@ class Show:
         check_value("pixel-sampler.num-rays-per-batch", rays, rays >= 1, "at least 1")
         check_output(self.output_path)
         views = read_blender(self.data, "train")
-        show(views, self.pixel_sampler, self.strategy, self.output_path, self.num_views, self.seed)
+        config = EdgeSEPixelSamplerConfig(**vars(self.pixel_sampler))
+        show(views, config, self.strategy, self.output_path, self.num_views, self.seed)
         print(self.output_path)
 
 

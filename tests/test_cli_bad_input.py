@@ -142,6 +142,11 @@ def test_missing_and_unknown_names(tmp_path: Path, edge_se):
     assert "mic" in refused(edge_se, tmp_path, "scenes", "--out", tmp_path / "s", "--names", "mike")
 
 
+def test_the_hint_at_a_misspelt_flag_names_the_whole_command(tmp_path: Path, edge_se):
+    for command, flag in (("train edge-nerf", "--max-num-iteratons"), ("bench chart", "--secnds")):
+        assert f"edge-se {command} --help" in rejected(edge_se, tmp_path, *command.split(), flag, 3)
+
+
 def test_the_parsers_message_needs_no_unicode(scene: Path):
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     command = [sys.executable, "-m", "edge_se_sampler.cli", "show", "--data", scene, "--sed", "3"]

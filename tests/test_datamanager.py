@@ -12,7 +12,7 @@ import torch
 from tiny import tiny_model, tiny_views
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
-from edge_se_sampler.data.datamanager import VanillaDataManager, image_batch, unit_interval
+from edge_se_sampler.data.datamanager import VanillaDataManager, image_batch
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import PixelSampler, PixelSamplerConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
@@ -74,13 +74,6 @@ def test_an_rgb_image_among_rgba_ones_gets_opaque_alpha() -> None:
 def test_no_views_are_refused() -> None:
     with pytest.raises(InputError, match="no training views"):
         image_batch(replace(VIEWS, images=()))
-
-
-def test_uint8_is_scaled_to_the_unit_interval_and_floats_are_kept() -> None:
-    assert unit_interval(torch.tensor([0, 51, 255], dtype=torch.uint8)).tolist() == pytest.approx([0, 0.2, 1])
-    assert unit_interval(torch.tensor([255], dtype=torch.uint8)).tolist() == [1.0]
-    floats = torch.tensor([0.25, 1.0])
-    assert unit_interval(floats) is floats
 
 
 # --- next_train ---

@@ -9,7 +9,7 @@ import pytest
 import torch
 from batches import MIXED, NUMBERS, SAME, batch_of, half_masks, picture
 
-from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.image_batch import ImageBatch, unit_interval
 
 SOME = torch.tensor([[2, 4, 3], [0, 8, 5], [1, 0, 0], [2, 0, 4], [0, 8, 5]])
 
@@ -107,3 +107,10 @@ def test_the_hosts_batch_is_not_touched() -> None:
         value.zero_()
     assert set(host) == set(kept)
     assert all(torch.equal(host[key], kept[key]) for key in kept)
+
+
+def test_uint8_is_scaled_to_the_unit_interval_and_floats_are_kept() -> None:
+    assert unit_interval(torch.tensor([0, 51, 255], dtype=torch.uint8)).tolist() == pytest.approx([0, 0.2, 1])
+    assert unit_interval(torch.tensor([255], dtype=torch.uint8)).tolist() == [1.0]
+    floats = torch.tensor([0.25, 1.0])
+    assert unit_interval(floats) is floats

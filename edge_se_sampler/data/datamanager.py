@@ -19,6 +19,7 @@ from edge_se_sampler.protocol import (
     TrainingCallbackAttributes,
     TrainingCallbackLocation,
 )
+from edge_se_sampler.sampling.image_batch import unit_interval
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels, build_scorer
 from edge_se_sampler.sampling.settings import SamplingSettings
 
@@ -100,11 +101,6 @@ def random_rays(cameras: Cameras, camera_indices: np.ndarray, rng: np.random.Gen
     size = torch.cat((cameras.height, cameras.width), dim=1).cpu().numpy()[camera_indices]
     pixels = (rng.random((len(camera_indices), 2)) * size).astype(np.int64)
     return cameras.pixel_rays(torch.from_numpy(np.concatenate((camera_indices[:, None], pixels), axis=1)))
-
-
-def unit_interval(image: Tensor) -> Tensor:
-    """Pixels as float in [0, 1]; uint8 is divided by 255."""
-    return image.float() / 255 if image.dtype == torch.uint8 else image
 
 
 def image_batch(views: Views) -> dict[str, Any]:

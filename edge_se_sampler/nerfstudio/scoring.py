@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.edges import WHITE
+from edge_se_sampler.sampling.image_batch import unit_interval
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule, Schedule
 
@@ -37,8 +38,7 @@ def squared_errors(model: Any, outputs: dict[str, Tensor], image: Tensor) -> Ten
         name = type(model).__name__
         raise InputError(f"{name} renders neither rgb nor rgb_fine: its squared errors cannot be computed")
     colors = outputs[f"rgb{level}"]
-    image = image.to(colors.device)
-    image = image.float() / 255 if image.dtype == torch.uint8 else image
+    image = unit_interval(image.to(colors.device))
     accumulation = outputs.get(f"accumulation{level}")
     renderer: Any = getattr(model, "renderer_rgb", None)
     if accumulation is not None and hasattr(renderer, "blend_background_for_loss_computation"):

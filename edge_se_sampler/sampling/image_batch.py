@@ -83,6 +83,11 @@ class ImageBatch:
         return picked
 
 
+def unit_interval(image: Tensor) -> Tensor:
+    """Pixels as float in [0, 1]; uint8 is divided by 255, which rounds otherwise than the product in `unit_float`."""
+    return image.float() / 255 if image.dtype == torch.uint8 else image
+
+
 def _sizes(images: Any) -> list[tuple[int, int]]:
     """Rows and columns of k images, stacked or in a list; nothing for what holds no images."""
     if isinstance(images, Tensor):

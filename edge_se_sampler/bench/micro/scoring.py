@@ -22,6 +22,7 @@ from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.sampling.image_batch import unit_interval
 from edge_se_sampler.sampling.strategies import RankedError
 
 ERROR_SOURCES = ("fine", "coarse", "cached")
@@ -75,7 +76,7 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
     rng = np.random.default_rng(0)
     pixels = [(n, *rng.integers(images[n].shape[:2])) for n in rng.integers(len(images), size=4096).tolist()]
     indices = torch.tensor(pixels)
-    image = torch.stack([images[n][row, column] for n, row, column in pixels]).float() / 255
+    image = unit_interval(torch.stack([images[n][row, column] for n, row, column in pixels]))
     outputs = render_outputs(model, manager.cameras.pixel_rays(indices), ("background", "rgb_fine", "rgb_coarse"))
     fine, coarse = (model.squared_error(outputs, image, network).numpy() for network in ("fine", "coarse"))
     cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)
