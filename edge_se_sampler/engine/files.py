@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
@@ -60,6 +59,8 @@ def write_json(path: Path, content: Any) -> None:
 
 def write_image(path: Path, image: np.ndarray) -> None:
     """Write an (H, W, 3) float image in [0, 1] as PNG."""
+    import imageio.v3 as iio  # slow to load: not for --help
+
     write_atomically(path, iio.imwrite("<bytes>", to_uint8(image), extension=".png"))
 
 
