@@ -6,21 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.micro.scoring import ERROR_SOURCES
 from edge_se_sampler.bench.report import describe_machine, fill_template, markdown_table
-
-SAMPLER_LABELS = {
-    "edge_all_images": "Edge, of all images",
-    "edge_one_image": "Edge, of one image",
-    "uniform_all_images": "Random, of all images",
-    "flat_searchsorted": "for comparison: torch.searchsorted in one CDF over all pixels",
-    "se_selection": "SE's selection by rank, errors given",
-    "nerfstudio_uniform": "for comparison: nerfstudio 1.1.5's uniform pixels",
-}
-ERROR_SOURCES = {
-    "fine": "the fine network, as in the paper (`fine`)",
-    "coarse": "the coarse network alone (`coarse`)",
-    "cached": "errors that training found there earlier (`cached`)",
-}
 
 
 def describe(folder: Path) -> str:
@@ -32,7 +19,7 @@ def describe(folder: Path) -> str:
         settings = parts["samplers"]["settings"]
         head = (f"{settings['draws']} pixels", f"median of {settings['rounds']} draws")
         times = parts["samplers"]["milliseconds"].items()
-        parts["draws"] = markdown_table(head, [(SAMPLER_LABELS[name], f"{value:.2f} ms") for name, value in times])
+        parts["draws"] = markdown_table(head, [(name, f"{value:.2f} ms") for name, value in times])
     if "scoring" in parts:
         scored = [result for result in results if result["benchmark"] == "scoring"]
         parts["scoring"] = "\n\n".join(map(_tabulate_scoring, scored))

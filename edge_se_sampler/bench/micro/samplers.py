@@ -17,20 +17,24 @@ from edge_se_sampler.sampling.ranking import sample_by_rank
 
 
 def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
-    """`tables` (`build_tables`), and median `milliseconds` of each kind of draw."""
+    """`tables` (`build_tables`), and median `milliseconds` of each kind of draw, by its label."""
     table, tables = build_tables(images, size)
     every_image, one_image = torch.arange(images), torch.tensor([images // 2])
     uniform = UniformPixels([(size, size)] * images)
     flat_cdf = torch.cumsum(torch.rand(images * size * size, dtype=torch.float64), dim=0)
     total, errors, extent = flat_cdf[-1], torch.rand(2 * draws), torch.tensor([images, size, size])
     cases: dict[str, Callable[[int], Any]] = {
-        "edge_all_images": lambda step: table.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
-        "edge_one_image": lambda step: table.draw(one_image, draws, stream(0, step, Stream.PIXELS)),
-        "uniform_all_images": lambda step: uniform.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
-        "flat_searchsorted": lambda _: torch.searchsorted(flat_cdf, torch.rand(draws, dtype=torch.float64) * total),
-        "se_selection": lambda step: sample_by_rank(errors, draws, stream(0, step, Stream.SELECTION)),
-        # what PixelSampler.sample_method of nerfstudio 1.1.5 computes without a mask
-        "nerfstudio_uniform": lambda _: (torch.rand((draws, 3)) * extent).long(),
+        "Edge, of all images": lambda step: table.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
+        "Edge, of one image": lambda step: table.draw(one_image, draws, stream(0, step, Stream.PIXELS)),
+        "Random, of all images": lambda step: uniform.draw(every_image, draws, stream(0, step, Stream.PIXELS)),
+        "for comparison: torch.searchsorted in one CDF over all pixels": lambda _: torch.searchsorted(
+            flat_cdf, torch.rand(draws, dtype=torch.float64) * total
+        ),
+        "SE's selection by rank, errors given": lambda step: sample_by_rank(
+            errors, draws, stream(0, step, Stream.SELECTION)
+        ),
+        # what nerfstudio's PixelSampler.sample_method computes without a mask
+        "for comparison: nerfstudio 1.1.5's uniform pixels": lambda _: (torch.rand((draws, 3)) * extent).long(),
     }
     return {"tables": tables, "milliseconds": median_milliseconds(cases, rounds)}
 

@@ -25,7 +25,11 @@ from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.image_batch import unit_interval
 from edge_se_sampler.sampling.strategies import RankedError
 
-ERROR_SOURCES = ("fine", "coarse", "cached")
+ERROR_SOURCES = {
+    "fine": "the fine network, as in the paper (`fine`)",
+    "coarse": "the coarse network alone (`coarse`)",
+    "cached": "errors that training found there earlier (`cached`)",
+}
 
 
 def measure(workplace: Path, scene: str, size: str, rays: int, rounds: int, iterations: int) -> dict[str, Any]:
