@@ -1,4 +1,4 @@
-"""README.md and pictures of the robustness sweep: failures by setting and strategy."""
+"""README.md of the robustness sweep: failures by setting and strategy."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN
 from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
-from edge_se_sampler.engine.figures import require_pyplot, save_figure
 
 FAILURE_MODES = {
     "dead at the start": "dead", "emptied": "emptied", "opaque background": "opaque", "underfit": "underfit",
@@ -39,14 +36,6 @@ def describe(folder: Path) -> str:
         settings=tabulate_settings(counts),
         reproduce=describe_command(result),
     )
-
-
-def draw(folder: Path, workplace: Path | None) -> None:
-    """Draw the pictures; none needs the workplace."""
-    del workplace
-    runs = read_result(folder / "result.json")["runs"]
-    if runs:
-        save_figure(draw_failure_rates(count_failure_modes(runs)), folder / "failure-rates.png")
 
 
 def count_failure_modes(runs: Sequence[Run]) -> dict[str, dict[str, Modes]]:
@@ -95,29 +84,7 @@ def _describe_modes(modes: Modes) -> str:
         return "–"
     failures, runs = _failures(modes), modes.total()
     low, high = wilson_interval(failures, runs)
-    text = f"**{failures}/{runs}** [{100 * low:.0f}–{100 * high:.0f}%]"
+    count = f"**{failures}/{runs}**" if 2 * failures > runs else f"{failures}/{runs}"
+    text = f"{count} [{100 * low:.0f}–{100 * high:.0f}%]"
     words = ", ".join(f"{modes[mode]} {word}" for mode, word in FAILURE_MODES.items() if modes[mode])
     return f"{text} ({words})" if words else text
-
-
-def draw_failure_rates(counts: dict[str, dict[str, Modes]]) -> Any:
-    """Failure rates as colors: settings down, strategies across."""
-    strategies = _strategies(counts)
-    figure, axis = require_pyplot().subplots(figsize=(1.05 * len(strategies) + 3.0, 0.33 * len(counts) + 1.9))
-    rates = np.full((len(counts), len(strategies)), np.nan)
-    for i, row in enumerate(counts.values()):
-        for j, modes in enumerate(row.values()):
-            if modes:
-                rates[i, j] = _failures(modes) / modes.total()
-                color = "white" if abs(rates[i, j] - 0.5) > 0.35 else "black"
-                text = f"{_failures(modes)}/{modes.total()}"
-                axis.text(j, i, text, ha="center", va="center", fontsize=8, color=color)
-    axis.imshow(rates, cmap="RdYlGn_r", vmin=0, vmax=1, aspect="auto")
-    labels = [STRATEGIES[strategy].label.replace(", ", ",\n") for strategy in strategies]
-    axis.set_xticks(range(len(strategies)), labels, fontsize=8)
-    axis.xaxis.tick_top()
-    axis.set_yticks(range(len(counts)), list(counts), fontsize=8)
-    axis.tick_params(length=0)
-    axis.set_xlabel("failed trainings; each setting differs from the base in what is named", fontsize=9)
-    figure.tight_layout()
-    return figure
