@@ -126,8 +126,6 @@ def test_the_command_trains_in_stages_what_is_pending(
     monkeypatch.setattr(schedule, "Settings", lambda: Settings(iterations=5))
     out = tmp_path / "out"
     flags = ["--output-dir", out, "--workplace", tmp_path / "w", "--seeds", 0, "--length-seeds", 0]
-    assert edge_se("bench", "schedule", *flags, "--parts", "failures").code == 0
-    assert len(json.loads((out / "result.json").read_text())["runs"]) == 4
     answer = edge_se("bench", "schedule", *flags)
     assert answer.code == 0, answer
     runs = json.loads((out / "result.json").read_text())["runs"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     the content of demo.json is returned. InputError: output_dir cannot be written, or matplotlib is missing."""
     require_pyplot()
     make_folder(output_dir, "--output-dir")
-    start = time.monotonic()
     scene = cached_scene(output_dir / "demo", **SCENE, **SPLITS)
     methods, views = {}, {}
     for method in METHODS:
@@ -41,7 +39,6 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     result = {
         **new_result("demo", {"scene": SCENE, "seed": seed, "iterations": ITERATIONS}),
         "background_psnr": float(np.mean([_background_psnr(picture) for picture in test])),
-        "total_seconds": round(time.monotonic() - start, 1),
         "methods": methods,
     }
     write_json(output_dir / "demo.json", result)

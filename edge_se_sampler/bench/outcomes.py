@@ -36,19 +36,19 @@ def failed(run: dict[str, Any]) -> bool:
     return run["outcome"] != "converged"
 
 
-def measure_outcome(results: dict[str, Any], pictures: list[Picture], color: float) -> dict[str, Any]:
-    """Compare a training, by its `evaluate` on pictures, with a plain grey background (0 black, 1 white).
+def measure_outcome(images: list[dict[str, Any]], pictures: list[Picture], color: float) -> dict[str, Any]:
+    """Compare a training, by the metrics of its images of pictures, with a plain grey background (0 black, 1 white).
 
-    Returns its outcome, background_psnr, and foreground_share: the error on the object as a share of the background's
-    there, a mean over views. InputError if no view tells the object from the background.
+    Returns its outcome, psnr, background_psnr, and foreground_share: the error on the object as a share of the
+    background's there; means over views. InputError if no view tells the object from the background.
     """
     background = [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
     key = "foreground_psnr"
-    views = zip(results["images"], background, strict=True)
+    views = zip(images, background, strict=True)
     gains = [rendered[key] - empty[key] for rendered, empty in views if None not in (rendered[key], empty[key])]
     if not gains:
         raise InputError("the held-out views show no object by alpha, which the rule of failure needs")
-    background_psnr = sum(view["psnr"] or 0.0 for view in background) / len(background)
+    psnr, background_psnr = (float(np.mean([view["psnr"] or 0.0 for view in views])) for views in (images, background))
     share = float(np.mean([10 ** (-gain / 10) for gain in gains]))
-    outcome = classify(results["psnr"], background_psnr, share)
-    return {"background_psnr": background_psnr, "foreground_share": share, "outcome": outcome}
+    outcome = classify(psnr, background_psnr, share)
+    return {"psnr": psnr, "background_psnr": background_psnr, "foreground_share": share, "outcome": outcome}

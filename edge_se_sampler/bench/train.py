@@ -57,8 +57,8 @@ def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> R
         view_path.parent.mkdir(parents=True, exist_ok=True)
         write_image(view_path, views[0])
     return {
-        **{key: results[key] for key in ("psnr", "foreground_psnr", "edge_band_psnr", "background_mse")},
-        **measure_outcome(results, pictures, model.config.background_level),
+        **measure_outcome(results["images"], pictures, model.config.background_level),
+        **{key: results[key] for key in ("foreground_psnr", "edge_band_psnr", "background_mse")},
         "dead_at_start": dead,
         "reinitialized": sum("reinitialized" in line for line in trainer.run.metrics()),
         "steps": trainer.next_step,

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -116,7 +117,8 @@ def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> R
     model, pictures = trainer.pipeline.model, to_pictures(read_test_views(trainer.config))
     queries = count_queries(model)
     due = [seconds for seconds in EVAL_SECONDS if ready < seconds < settings.seconds]
-    curve, results = [], {}
+    curve: list[list[float]] = []
+    results: dict[str, Any] = {}
     for steps in range(1, iterations + 1):
         start = settings.clock()
         trainer.train_iteration(steps - 1)
@@ -130,7 +132,7 @@ def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> R
             curve.append([round(spent, 3), steps, queries[0], round(results["psnr"], 3)])
         if is_last:
             break
-    outcome = measure_outcome(results, pictures, model.config.background_level)["outcome"]
+    outcome = measure_outcome(results["images"], pictures, model.config.background_level)["outcome"]
     run = {"planned_steps": iterations, "ready_seconds": ready, "psnr": results["psnr"], "outcome": outcome}
     return run | dict(zip(("seconds", "steps", "queries"), curve[-1], strict=False)) | {"curve": curve}
 

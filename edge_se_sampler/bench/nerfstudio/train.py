@@ -6,7 +6,6 @@ Its vanilla NeRF has a softplus density, torch's initial weights and RAdam; the 
 from __future__ import annotations
 
 import contextlib
-import statistics
 import time
 import warnings
 from dataclasses import dataclass
@@ -48,7 +47,7 @@ class Trial:
 
 
 def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: Path) -> dict[str, Any]:
-    """Train once and measure the test views: seconds, cpu_seconds, psnr, and those of `measure_outcome`."""
+    """Train once and measure the test views: seconds, cpu_seconds, and those of `measure_outcome`."""
     config = build_config(trial.method, trial.seed, data, workplace / "runs")
     config.max_num_iterations = settings.iterations
     config.pipeline.datamanager.train_num_rays_per_batch = settings.rays
@@ -62,6 +61,4 @@ def run_trial(trial: Trial, settings: TrainingSettings, data: Path, workplace: P
         views = render_test_views(trainer)
     pictures = to_pictures(read_blender(data, "test"))
     images = [compute_metrics(view, picture.image, 1.0) for view, picture in zip(views, pictures, strict=True)]
-    psnr = statistics.mean(image["psnr"] or 0.0 for image in images)
-    outcome = measure_outcome({"psnr": psnr, "images": images}, pictures, 1.0)
-    return {"seconds": seconds, "cpu_seconds": cpu_seconds, "psnr": psnr, **outcome}
+    return {"seconds": seconds, "cpu_seconds": cpu_seconds, **measure_outcome(images, pictures, 1.0)}

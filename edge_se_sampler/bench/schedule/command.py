@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from edge_se_sampler.bench.command import ExperimentCommand
 from edge_se_sampler.bench.runner import Experiment, Run
@@ -15,8 +14,6 @@ class BenchSchedule(ExperimentCommand):
     """Test the adaptive schedule: failures, paired with Random's, and PSNR against the best fixed early phase.
     Resumes."""
 
-    parts: tuple[Literal["failures", "lengths"], ...] = ("failures", "lengths")
-    """Which of the two tests."""
     seeds: tuple[int, ...] = tuple(range(10))
     """Of the test of failures."""
     length_seeds: tuple[int, ...] = (0, 1, 2)
@@ -26,15 +23,13 @@ class BenchSchedule(ExperimentCommand):
         from edge_se_sampler.bench.paper import trials as paper
         from edge_se_sampler.bench.schedule import trials as schedule
 
-        if not (self.parts and self.length_seeds):
-            raise InputError("--parts and --length-seeds: give at least one of each")
         if overlap := sorted(set(self.length_seeds) & set(schedule.selection_seeds(schedule.LENGTHS[0]))):
             raise InputError(f"--length-seeds: the fixed phase is selected on {overlap}; name others")
         settings = schedule.Settings()
 
         def trials(runs: list[Run]) -> list[schedule.Trial]:
-            failures = schedule.list_failure_trials(settings, self.seeds) if "failures" in self.parts else []
-            return failures + (schedule.list_length_trials(runs, self.length_seeds) if "lengths" in self.parts else [])
+            failures = schedule.list_failure_trials(settings, self.seeds)
+            return failures + schedule.list_length_trials(runs, self.length_seeds)
 
         def arguments(trial: schedule.Trial) -> tuple[object, ...]:
             data = paper.synthetic_scene(trial.table, trial.scene, paper.Settings(), self.workplace)
