@@ -43,7 +43,10 @@ def ball(radius: float = 1.0) -> Hull:
 
 def model_in(hull: Hull, **changes: Any) -> LeanModel:
     """A tiny one in float64, its features not all 0."""
-    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), **changes)
+    config = replace(
+        LeanModelConfig(size="tiny", width=8, depth=2, position_frequencies=2, direction_frequencies=1, feature_dim=3),
+        **changes,
+    )
     model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(hull)).double()
     assert model.features is not None
     with torch.no_grad():
@@ -55,7 +58,7 @@ def reloaded(model: LeanModel) -> LeanModel:
     """Another model from its state."""
     state = model.state_dict()
     grid = saved_grid(state)
-    assert grid is not None
+    assert isinstance(grid, OccupancyGrid)
     other = LeanModel(model.config, np.random.default_rng(5), grid).to(model.dtype)
     load_weights(other, state)
     return other
@@ -151,11 +154,13 @@ def test_a_dense_cell_stays() -> None:
 
 
 def test_without_features_there_is_the_network_alone() -> None:
-    config = LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=0)
+    config = LeanModelConfig(
+        size="tiny", width=8, depth=2, position_frequencies=2, direction_frequencies=1, feature_dim=0
+    )
     model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(ball()))
-    ((weights, rate),) = model.parameter_groups()
-    assert rate == 1
-    assert len(weights) == len(list(model.fine.parameters())) == len(list(model.parameters()))
+    (group,) = model.parameter_groups()
+    assert group.lr_scale == 1
+    assert len(group.parameters) == len(list(model.fine.parameters())) == len(list(model.parameters()))
     loss_of(model.double().train()).backward()
     assert model.fine.layers[0].weight.grad.any()  # pyright: ignore
 
@@ -185,7 +190,7 @@ def test_pruning_is_a_function_of_the_seed() -> None:
 def test_an_uncarved_box_is_transparent_at_first(count: int) -> None:
     size = 3.0
     cube = Hull(np.full(3, -size / 2), size / count, np.ones((count, count, count), dtype=bool))
-    config = LeanModelConfig("tiny", 32, 1, 4, 2)
+    config = LeanModelConfig(size="tiny", width=32, depth=1, position_frequencies=4, direction_frequencies=2)
     model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(cube))
     cube.cells[: count // 2] = False  # carved
     fog = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(cube))

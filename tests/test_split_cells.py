@@ -24,7 +24,10 @@ EARLY = UPDATE_INTERVAL // 2
 
 def open_model(max_level: int = 1, **changes: Any) -> LeanModel:
     """In a cube of which nothing is known."""
-    config = replace(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), **changes)
+    config = replace(
+        LeanModelConfig(size="tiny", width=8, depth=2, position_frequencies=2, direction_frequencies=1, feature_dim=3),
+        **changes,
+    )
     grid = OccupancyGrid.from_hull(Hull(np.full(3, -1.2), SIDE, np.ones((8, 8, 8), dtype=bool)), max_level)
     return LeanModel(config, np.random.default_rng(0), grid).double().train()
 
@@ -65,7 +68,11 @@ def test_subdivided_cells_stay_in_the_hull() -> None:
     shown = torch.rand((8, 8, 8), generator=torch.Generator().manual_seed(0)) < 0.5
     shown[3:5, 3:5, 3:5] = True
     grid = OccupancyGrid.from_hull(Hull(np.full(3, -1.2), SIDE, shown.numpy()), 1, 1)
-    model = LeanModel(LeanModelConfig("tiny", 8, 2, 2, 1, feature_dim=3), np.random.default_rng(0), grid)
+    model = LeanModel(
+        LeanModelConfig(size="tiny", width=8, depth=2, position_frequencies=2, direction_frequencies=1, feature_dim=3),
+        np.random.default_rng(0),
+        grid,
+    )
     assert bool(cells(model).static_mask[2:4, 2:4, 2:4].all())  # of two cells each, and a rim
     see_density(model, 100.0)
     occupied_after(model, 2 * EARLY)

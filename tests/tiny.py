@@ -16,7 +16,7 @@ from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline
+from edge_se_sampler.engine.pipeline import Pipeline, saved_grid
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.engine.trainer import Trainer
@@ -54,7 +54,7 @@ def tiny_model(seed: int = 0, grid: OccupancyGrid | None = None, **changes: Any)
 
 def cells(model: RayModel) -> OccupancyGrid:
     """The grid of a model that has one."""
-    assert model.grid is not None
+    assert isinstance(model.grid, OccupancyGrid)
     return model.grid
 
 
@@ -129,6 +129,30 @@ def tiny_trainer(config: TrainerConfig, views: Views, output_dir: Path | None = 
 def resume_trainer(trainer: Trainer, views: Views) -> Trainer:
     """Another trainer, which continues from the last checkpoint of this one."""
     config, run = trainer.config, trainer.run
-    resumed = config.setup(run=run, pipeline=Pipeline.build(config, views, "cpu"), preview=None)
-    resumed.resume(load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config)))
+    state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
+    pipeline = Pipeline.build(config, views, "cpu", saved_grid(state["model"]))
+    resumed = config.setup(run=run, pipeline=pipeline, preview=None)
+    resumed.resume(state)
     return resumed
+
+
+def ball_views(count: int = 6, size: int = 16, radius: float = 1.0) -> Views:
+    """Views, from 4 world units away, of a ball around the origin with the color of its normal, in front of nothing."""
+    rng = np.random.default_rng(3)
+    poses = np.zeros((count, 3, 4))
+    for pose in poses:
+        back = rng.normal(size=3)
+        back /= np.linalg.norm(back)
+        right = np.cross((0.0, 1.0, 0.0), back)
+        right /= np.linalg.norm(right)
+        pose[:] = np.stack((right, np.cross(back, right), back, 4 * back), axis=1)
+    cameras = Cameras.of(poses, fx=1.4 * size, fy=1.4 * size, cx=size / 2, cy=size / 2, width=size, height=size)
+    images = []
+    for i in range(count):
+        rays = cameras.image_rays(i)
+        middle = -(rays.origins * rays.directions).sum(dim=1)
+        below = radius**2 - (rays.origins.square().sum(dim=1) - middle.square())
+        normal = (rays.origins + (middle - below.clamp(min=0).sqrt())[:, None] * rays.directions) / radius
+        pixels = torch.cat((normal / 2 + 0.5, (below[:, None] > 0).double()), dim=1).clamp(0, 1) * 255
+        images.append(pixels.byte().numpy().reshape(size, size, 4))
+    return Views(tuple(f"view {i}" for i in range(count)), tuple(images), None, cameras)

@@ -47,6 +47,11 @@ LEAN_PRESETS = {
     "small": SizePreset(64, 1, 6, 2, 6e-3, 512, 20_000),
     "tiny": SizePreset(64, 1, 6, 2, 6e-3, 256, 12_000),
 }
+VOXEL_PRESETS = {
+    "paper": SizePreset(64, 1, 0, 0, 1e-2, 8192, 7_000),
+    "small": SizePreset(64, 1, 0, 0, 1e-2, 8192, 4_000),
+    "tiny": SizePreset(64, 1, 0, 0, 1e-2, 8192, 2_000),
+}
 
 
 @dataclass(frozen=True)
@@ -57,24 +62,12 @@ class ModelConfig(InstantiateConfig):
 
     size: Literal["auto", "paper", "small", "tiny"] = "auto"
     """Networks and samples: the paper's, or smaller ones for smaller images; auto: by the images' longest side."""
-    width: int | None = None
-    """Neurons of a layer."""
-    depth: int | None = None
-    """Layers before the density; the encoded position joins again after the fifth."""
-    position_frequencies: int | None = None
-    """Frequencies that encode a position."""
-    direction_frequencies: int | None = None
-    """Frequencies that encode a direction."""
-    initialization: Literal["xavier", "torch"] = "xavier"
-    """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
     background_color: Literal["white", "black", "random"] = "white"
     """Background of the scene; random: another color for every training ray, white in evaluation."""
     near: float = 2.0
     """Depth along the optical axis at which samples begin, world units."""
     far: float = 6.0
     """Depth at which samples end, world units."""
-    empty_space_skipping: bool = False
-    """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
     voxel_size_px: float = 1.0
     """Size of a grid cell, in footprints of a pixel at the center of the scene; larger where there would be more cells
     than are worth their memory."""
@@ -92,12 +85,12 @@ class ModelConfig(InstantiateConfig):
     @property
     def needs_grid(self) -> bool:
         """Whether the model is built on the scene's occupancy grid."""
-        return self.empty_space_skipping
+        return True
 
     @property
     def culls_by_alpha(self) -> bool:
         """Whether the grid is the visual hull of the alpha masks, where there are any."""
-        return self.empty_space_skipping
+        return True
 
     @property
     def prunes_cells(self) -> bool:
@@ -108,8 +101,38 @@ class ModelConfig(InstantiateConfig):
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
         if not 0 <= self.near < self.far < INFINITY:
             raise InputError(f"--{prefix}near is {self.near}, --{prefix}far {self.far}: 0 <= near < far")
-        size_px, preset = self.voxel_size_px, self.preset
+        size_px = self.voxel_size_px
         check_value(f"{prefix}voxel-size-px", size_px, 0 < size_px <= 1000, "above 0, at most 1000")
+
+
+@dataclass(frozen=True)
+class FieldModelConfig(ModelConfig):
+    """What models have whose network takes encoded positions and directions."""
+
+    width: int | None = None
+    """Neurons of a layer."""
+    depth: int | None = None
+    """Layers before the density; the encoded position joins again after the fifth."""
+    position_frequencies: int | None = None
+    """Frequencies that encode a position."""
+    direction_frequencies: int | None = None
+    """Frequencies that encode a direction."""
+    initialization: Literal["xavier", "torch"] = "xavier"
+    """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
+    empty_space_skipping: bool = False
+    """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
+
+    @property
+    def needs_grid(self) -> bool:
+        return self.empty_space_skipping
+
+    @property
+    def culls_by_alpha(self) -> bool:
+        return self.empty_space_skipping
+
+    def check(self, prefix: str = "") -> None:
+        super().check(prefix)
+        preset = self.preset
         check_value(f"{prefix}depth", preset.depth, preset.depth >= 1, "at least 1")
         width_rule = "at least 2 (the layer of the direction has half of it)"
         check_value(f"{prefix}width", preset.width, preset.width >= 2, width_rule)
@@ -119,7 +142,7 @@ class ModelConfig(InstantiateConfig):
 
 
 @dataclass(frozen=True)
-class NeRFModelConfig(ModelConfig):
+class NeRFModelConfig(FieldModelConfig):
     """The original NeRF: two networks, coarse and fine."""
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.nerf:NeRFModel"
@@ -142,7 +165,7 @@ class NeRFModelConfig(ModelConfig):
 
 
 @dataclass(frozen=True)
-class LeanModelConfig(ModelConfig):
+class LeanModelConfig(FieldModelConfig):
     """One small network on a grid of features, evaluated only where the scene is."""
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.lean:LeanModel"
@@ -179,6 +202,60 @@ class LeanModelConfig(ModelConfig):
         check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
         check_value(f"{prefix}feature-dim", self.feature_dim, 0 <= self.feature_dim <= 64, "between 0 and 64")
         check_value(f"{prefix}feature-lr-scale", scale, 0 < scale < INFINITY, "above 0")
+
+
+@dataclass(frozen=True)
+class VoxelModelConfig(ModelConfig):
+    """Density and features at the corners of sparse cells, and a small network for color."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.models.voxels:VoxelModel"
+    presets: ClassVar[Mapping[str, SizePreset]] = VOXEL_PRESETS
+
+    cull_by_alpha: bool = True
+    """Leave out what lies outside the visual hull of the alpha masks."""
+    step_size_voxels: float = 1.0
+    """Distance between samples, as a multiple of a cell's size."""
+    alpha_threshold: float = 0.008
+    """Samples of less opacity are left out."""
+    weight_threshold: float = 0.004
+    """Samples that count less in their ray's color are not asked for one."""
+    transmittance_threshold: float = 0.006
+    """A ray ends where less of its light passes."""
+    prune_weight: float = 0.02
+    """Cells that never counted more in a ray's color are pruned."""
+    density_lr_scale: float = 60.0
+    """Learning rate of the density, as a multiple of the network's."""
+    feature_lr_scale: float = 20.0
+    """Learning rate of the features, as a multiple of the network's."""
+    total_variation: float = 1e-4
+    """How much, beside a ray's squared error, squared differences between features of neighboring corners count."""
+    alpha_loss: float = 0.3
+    """How much, beside a ray's squared error, that of its opacity against alpha counts: else what has the background's
+    color may float in front of it."""
+    max_memory: float = 2.5
+    """GiB that density and features may take in training; cells are subdivided only as far as that allows."""
+
+    @property
+    def culls_by_alpha(self) -> bool:
+        return self.cull_by_alpha
+
+    @property
+    def prunes_cells(self) -> bool:
+        return True
+
+    def check(self, prefix: str = "") -> None:
+        super().check(prefix)
+        step = self.step_size_voxels
+        check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
+        for name in ("alpha_threshold", "weight_threshold", "transmittance_threshold", "prune_weight"):
+            value = getattr(self, name)
+            check_value(prefix + name.replace("_", "-"), value, 0 <= value < 1, "in [0, 1)")
+        for name in ("total_variation", "alpha_loss"):
+            value = getattr(self, name)
+            check_value(prefix + name.replace("_", "-"), value, 0 <= value < INFINITY, "at least 0")
+        for name in ("density_lr_scale", "feature_lr_scale", "max_memory"):
+            value = getattr(self, name)
+            check_value(prefix + name.replace("_", "-"), value, 0 < value < INFINITY, "above 0")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from edge_se_sampler.models.packed_rendering import (
     render_packed,
     transmittance,
 )
-from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
 from edge_se_sampler.occupancy.features import FeatureGrid
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid, dilate, upsample
 
@@ -94,11 +94,12 @@ class LeanModel(RayModel):
     def rays_per_chunk(self) -> int:
         return 4096
 
-    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         if self.features is None:
             return super().parameter_groups()
         # the features learn faster than the network: each sees few samples
-        return [(list(self.fine.parameters()), 1.0), ([self.features.table], self.config.feature_lr_scale)]
+        network, table = list(self.fine.parameters()), [self.features.table]
+        return [ParameterGroup(network), ParameterGroup(table, self.config.feature_lr_scale)]
 
     def begin_step(self, step: int, seed: int) -> None:
         """As `RayModel`; at intervals, prunes and subdivides the grid."""

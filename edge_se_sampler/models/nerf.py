@@ -22,6 +22,7 @@ class NeRFModel(RayModel):
     """Coarse and fine networks, stratified and importance samples. `rng` draws the initial weights."""
 
     networks = ("coarse", "fine")
+    grid: OccupancyGrid | None
 
     def __init__(self, config: NeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None) -> None:
         super().__init__(config, grid)

@@ -4,13 +4,29 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import ModelConfig
+from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Weights that are optimized alike."""
+
+    parameters: list[nn.Parameter]
+    lr_scale: float = 1.0
+    """Their learning rate, as a multiple of the run's."""
+    maximum: float = float("inf")
+    """What rows of theirs that have a sparse gradient may become at most."""
+    total_variation: float = 0.0
+    """How much, beside a ray's squared error, the squared differences of such rows to their neighbors count."""
 
 
 class RayModel(nn.Module, ABC):
@@ -20,7 +36,7 @@ class RayModel(nn.Module, ABC):
     networks: tuple[str, ...] = ("fine",)
     """Names of the networks, each an attribute; the colors of "fine" are the model's."""
 
-    def __init__(self, config: ModelConfig, grid: OccupancyGrid | None) -> None:
+    def __init__(self, config: ModelConfig, grid: OccupancyGrid | BrickGrid | None) -> None:
         super().__init__()
         self.config = config
         self.grid = grid
@@ -58,9 +74,13 @@ class RayModel(nn.Module, ABC):
             ray; background (n, 3), the colors that the rays are composited on.
         """
 
-    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
-        """Groups of weights, each with its learning rate as a multiple of the run's."""
-        return [(list(self.parameters()), 1.0)]
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """All weights, in groups that are optimized differently."""
+        return [ParameterGroup(list(self.parameters()))]
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """What the model does between training steps; nothing by default."""
+        return []
 
     def begin_step(self, step: int, seed: int) -> None:
         """Begin training step 0, 1, 2, ...: all that it draws is a function of the seed."""

@@ -12,6 +12,7 @@ import torch
 
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid
 from edge_se_sampler.occupancy.hull import Box, Hull, Silhouette, carve, find_box, find_silhouettes
 
@@ -39,6 +40,55 @@ class SceneAnalysis:
         """The cells with which training begins."""
         return OccupancyGrid.from_hull(self.hull, self.max_level, self.coarsening)
 
+    def brick_grid(self) -> BrickGrid:
+        """The same, sparse."""
+        hull = self.hull
+        return BrickGrid(torch.from_numpy(hull.aabb_min), hull.cell_size, torch.from_numpy(hull.cells), self.max_level)
+
+
+def analyze_levels(views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool) -> SceneAnalysis:
+    """As `analyze_scene`, for cells that training subdivides again and again: it begins with cells of 2^k times the
+    size that is wanted in the end, k at least 2, and large enough for MAX_OCCUPIED_CELLS of them to fill the hull."""
+    box = find_box(views, near, far)
+    finest = voxel_size_px * box.pixel_footprint
+    silhouettes = find_silhouettes(views) if by_alpha else {}
+    hull, max_level = _initial_hull(views, silhouettes, box, finest)
+    if silhouettes and (hull is None or _missed_fraction(views, silhouettes, hull) > MAX_MISSED_FRACTION):
+        _warn_of_masks(near, far)
+        silhouettes = {}
+        hull, max_level = _initial_hull(views, {}, box, finest)
+    if hull is None:
+        raise _nothing_seen(box)
+    return SceneAnalysis(box, len(silhouettes), hull, 0, max_level)
+
+
+def _initial_hull(views: Views, silhouettes: dict[int, Silhouette], box: Box, finest: float) -> tuple[Hull | None, int]:
+    """The hull in the cells with which training begins, and how often they are to be subdivided."""
+    level = 2
+    while True:
+        size = finest * 2**level
+        # a box of more cells takes long to carve
+        within = (2 * box.half_extent / size) ** 3 <= 64 * MAX_OCCUPIED_CELLS
+        hull = carve(views, silhouettes, box, size) if within else None
+        if within and (hull is None or hull.cells.sum() <= MAX_OCCUPIED_CELLS):
+            return hull, level
+        level += 1
+
+
+def _warn_of_masks(near: float, far: float) -> None:
+    print(
+        f"the views' alpha masks carve nothing away: the object does not lie between near {near:g} and far "
+        f"{far:g} (set both), or they do not agree on where it is, or show too little of it",
+        file=sys.stderr,
+    )
+
+
+def _nothing_seen(box: Box) -> InputError:
+    return InputError(
+        "no training view sees anything of what lies between --pipeline.model.near and far around "
+        f"({', '.join(f'{x:.2f}' for x in box.center)}): check the cameras' poses and principal points"
+    )
+
 
 def analyze_scene(
     views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool, prunable: bool
@@ -60,17 +110,10 @@ def analyze_scene(
     silhouettes = find_silhouettes(views) if by_alpha else {}
     hull = _bounded_hull(views, silhouettes, box, cell_size, MAX_OCCUPIED_CELLS if silhouettes else max_uncarved)
     if silhouettes and (hull is None or _missed_fraction(views, silhouettes, hull) > MAX_MISSED_FRACTION):
-        print(
-            f"the views' alpha masks carve nothing away: the object does not lie between near {near:g} and far "
-            f"{far:g} (set both), or they do not agree on where it is, or show too little of it",
-            file=sys.stderr,
-        )
+        _warn_of_masks(near, far)
         silhouettes, hull = {}, _bounded_hull(views, {}, box, cell_size, max_uncarved)
     if hull is None:
-        raise InputError(
-            "no training view sees anything of what lies between --pipeline.model.near and far around "
-            f"({', '.join(f'{x:.2f}' for x in box.center)}): check the cameras' poses and principal points"
-        )
+        raise _nothing_seen(box)
     coarsening = max_level = int(prunable and bool(silhouettes))
     if prunable and not silhouettes:
         wanted, possible = np.log2(hull.cell_size / cell_size), np.log2(MAX_GRID_CELLS / hull.cells.size) / 3

@@ -1,0 +1,219 @@
+"""Rays through a `BrickGrid`: samples, values at them, and their colors. Plain torch, on any device; the reference of
+`voxel_kernels`, which has the same functions for a CPU.
+
+n      rays
+m      samples, of all rays one after the other
+c      colored samples: those of the m whose weight in their ray's color is worth asking the network
+tau    optical depth of a sample: density times step
+T      transmittance: share of the light that passes all samples before one
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from edge_se_sampler.occupancy.bricks import BRICK, OFFSETS, BrickGrid
+
+NUM_HARMONICS = 16
+"""Spherical harmonics up to degree 3."""
+
+
+@dataclass(frozen=True)
+class Marching:
+    """How rays are sampled."""
+
+    step: float
+    """Distance between samples, in sides of a cell."""
+    density_scale: float
+    """tau of a sample is this times exp of its raw density."""
+    alpha_min: float
+    """Samples of less opacity are left out."""
+    weight_min: float
+    """Samples of less weight have no color: black, at their full opacity."""
+    transmittance_min: float
+    """A ray ends where less light passes."""
+
+
+@dataclass(frozen=True)
+class RaySpans:
+    """n rays in units of cells, and the part of each in the box and between the depths."""
+
+    origins: Tensor  # (n, 3)
+    directions: Tensor  # (n, 3) unit vectors
+    begin: Tensor  # (n,)
+    end: Tensor  # (n,)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of n rays."""
+
+    t: Tensor
+    """(m,) distance from the ray's origin, in sides of a cell."""
+    ray_indices: Tensor
+    """(m,) int64."""
+    rows: Tensor
+    """(m, 8) int32: rows of the corners of its cell, the first being the cell's own."""
+    weights: Tensor
+    """(m, 8): their shares in what is interpolated."""
+    colored: Tensor
+    """(c,) int64: which samples have a color."""
+
+
+def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | None, marching: Marching) -> Samples:
+    """The samples of rays in occupied cells, as far as light passes.
+
+    Args:
+        density: (64 K, 1) raw density at the corners.
+        jitter: (n,) in [0, 1): share of a step before the first sample; None: half a step.
+    """
+    begin, end = spans.begin[:, None], spans.end[:, None]
+    count = int(((end - begin).clamp(min=0).max() / marching.step).ceil()) + 1 if len(begin) else 0
+    offsets = torch.arange(count, device=begin.device, dtype=begin.dtype)
+    t = begin + (offsets + (0.5 if jitter is None else jitter[:, None])) * marching.step
+    ray, index = torch.nonzero(t < end, as_tuple=True)
+    position = spans.origins[ray] + t[ray, index][:, None] * spans.directions[ray]
+    cell = position.floor().long()
+    inside = ((cell >= 0) & (cell < grid.size)).all(dim=1)
+    ray, index, position, cell = ray[inside], index[inside], position[inside], cell[inside]
+    brick = grid.table[tuple((cell // BRICK).T)].long()
+    in_brick = (cell % BRICK * torch.tensor([BRICK * BRICK, BRICK, 1], device=cell.device)).sum(dim=1)
+    occupied = (brick >= 0) & grid.occupied[brick.clamp(min=0), in_brick]
+    ray, index, brick, in_brick = ray[occupied], index[occupied], brick[occupied], in_brick[occupied]
+    rows = grid.corner_rows(brick, in_brick)
+    weights = corner_weights(position[occupied] - cell[occupied])
+    tau = torch.exp(interpolate(density, rows, weights)[:, 0]) * marching.density_scale
+    alpha = 1 - torch.exp(-tau)
+    opaque = alpha > marching.alpha_min
+    passing = torch.ones_like(t)
+    passing[ray, index] = torch.where(opaque, 1 - alpha, 1.0)
+    passing = torch.cat((torch.ones_like(begin), passing.cumprod(dim=1)), dim=1)[ray, index]
+    kept = opaque & (passing >= marching.transmittance_min)
+    colored = torch.nonzero((passing * alpha > marching.weight_min)[kept])[:, 0]
+    return Samples(t[ray, index][kept], ray[kept], rows[kept].int(), weights[kept], colored)
+
+
+def corner_weights(fraction: Tensor) -> Tensor:
+    """(m, 8) shares of a cell's corners at positions (m, 3) in it, in [0, 1)."""
+    (x, y, z), (u, v, w) = fraction.unbind(dim=1), (1 - fraction).unbind(dim=1)
+    uv, uy, xv, xy = u * v, u * y, x * v, x * y
+    return torch.stack((uv * w, uv * z, uy * w, uy * z, xv * w, xv * z, xy * w, xy * z), dim=1)
+
+
+def interpolate(values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """(m, F) of values (64 K, F) at the corners, by rows and weights (m, 8). The gradient of the values is sparse."""
+    return (F.embedding(rows.long(), values, sparse=True) * weights[:, :, None]).sum(dim=1)
+
+
+@dataclass(frozen=True)
+class NetworkWeights:
+    """A network of one hidden layer of H neurons: features and spherical harmonics of the direction -> color."""
+
+    hidden: Tensor  # (F, H)
+    view: Tensor  # (16, H)
+    view_bias: Tensor  # (H,)
+    color: Tensor  # (3, H)
+    color_bias: Tensor  # (3,)
+
+
+def shade(features: Tensor, directions: Tensor, ray_indices: Tensor, weights: NetworkWeights) -> Tensor:
+    """Colors (c, 3) in [0, 1] of features (c, F), on rays ray_indices (c,), ascending, of unit directions (n, 3)."""
+    view = torch.addmm(weights.view_bias, spherical_harmonics(directions), weights.view)
+    hidden = F.relu(features @ weights.hidden + view.index_select(0, ray_indices))
+    return torch.sigmoid(F.linear(hidden, weights.color, weights.color_bias))
+
+
+def spherical_harmonics(directions: Tensor) -> Tensor:
+    """(n, 16) real spherical harmonics up to degree 3 of unit vectors (n, 3)."""
+    x, y, z = directions.unbind(dim=1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        (
+            torch.full_like(x, 0.28209479),
+            -0.48860251 * y,
+            0.48860251 * z,
+            -0.48860251 * x,
+            1.09254843 * x * y,
+            -1.09254843 * y * z,
+            0.31539157 * (2 * zz - xx - yy),
+            -1.09254843 * x * z,
+            0.54627421 * (xx - yy),
+            -0.59004359 * y * (3 * xx - yy),
+            2.89061144 * x * y * z,
+            -0.45704579 * y * (4 * zz - xx - yy),
+            0.37317633 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.45704579 * x * (4 * zz - xx - yy),
+            1.44530572 * z * (xx - yy),
+            -0.59004359 * x * (xx - 3 * yy),
+        ),
+        dim=1,
+    )
+
+
+def composite(tau: Tensor, color: Tensor, samples: Samples, num_rays: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Colors (n, 3), accumulated opacity (n, 1) and weights (c,) of colored samples, by tau (m,) and color (c, 3)
+    (NeRF, equation 3)."""
+    total = torch.zeros(num_rays, dtype=torch.float64, device=tau.device)
+    total = total.index_add(0, samples.ray_indices, tau.double())
+    before = tau.double().cumsum(0) - tau - (total.cumsum(0) - total)[samples.ray_indices]
+    weight = (torch.exp(-before) * -torch.expm1(-tau.double())).to(tau.dtype)[samples.colored]
+    rgb = tau.new_zeros((num_rays, 3)).index_add(0, samples.ray_indices[samples.colored], weight[:, None] * color)
+    return rgb, -torch.expm1(-total)[:, None].to(tau.dtype), weight.detach()
+
+
+def resample(bricks: Tensor, parents: Tensor, values: Tensor) -> Tensor:
+    """Values (64 K, F) at the corners of cells, of those at the corners of cells twice as large that surround them.
+
+    Args:
+        bricks: (K, 3) int64: positions of the bricks, in bricks.
+        parents: `BrickGrid.numbers` of the larger cells.
+        values: (64 K', F) at the corners of the larger cells.
+    """
+    cells = torch.cartesian_prod(*[torch.arange(BRICK, device=bricks.device)] * 3)
+    chunks = []
+    for some in bricks.split(2**13):
+        corner = (BRICK * some[:, None] + cells).reshape(-1, 1, 3)
+        around = (corner + OFFSETS.to(bricks.device)) // 2  # each of them as often as it counts
+        parent = parents[tuple((around // BRICK).unbind(dim=2))].long()
+        row = (around % BRICK * torch.tensor([BRICK * BRICK, BRICK, 1], device=bricks.device)).sum(dim=2) + 64 * parent
+        share = (parent >= 0).to(values.dtype)
+        share = share / share.sum(dim=1, keepdim=True).clamp(min=1)
+        chunks.append((values[row.clamp(min=0)] * share[:, :, None]).sum(dim=1))
+    return torch.cat(chunks)
+
+
+def adam_rows(
+    values: Tensor, mean: Tensor, square: Tensor, gradient: Tensor,
+    *, lr: float, betas: tuple[float, float], eps: float, maximum: float, total_variation: float,
+) -> None:  # fmt: skip
+    """A step of Adam without bias correction on those rows of values (64 K, F) that a sparse gradient has.
+
+    Args:
+        mean: (64 K, F) running mean of the gradients.
+        square: (64 K, F) running mean of their squares.
+        maximum: what values become at most.
+        total_variation: weight of the squared differences to neighbors in the same brick, half of which each row adds
+            to the loss.
+    """
+    gradient = gradient.coalesce()
+    rows, gradient = gradient.indices()[0], gradient.values()
+    if total_variation:
+        gradient = gradient + total_variation * difference_to_neighbors(values, rows)
+    mean[rows] = torch.lerp(gradient, mean[rows], betas[0])
+    square[rows] = torch.lerp(gradient.square(), square[rows], betas[1])
+    values[rows] = (values[rows] - lr * mean[rows] / (square[rows].sqrt() + eps)).clamp(max=maximum)
+
+
+def difference_to_neighbors(values: Tensor, rows: Tensor) -> Tensor:
+    """Sum over a row's up to six neighbors in its brick of values[row] - values[neighbor], (k, F) for rows (k,)."""
+    total = torch.zeros_like(values[rows])
+    for stride in (1, BRICK, BRICK * BRICK):
+        position = rows // stride % BRICK
+        for offset, inside in ((stride, position < BRICK - 1), (-stride, position > 0)):
+            neighbors = torch.where(inside, rows + offset, rows)
+            total += values[rows] - values[neighbors]
+    return total

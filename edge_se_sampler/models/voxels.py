@@ -1,0 +1,229 @@
+"""The voxel model: density and features at the corners of sparse cells, and a small network that turns features and
+direction into color. Training begins with large cells, and subdivides those that it sees something in.
+
+The parts are known: features at the corners of sparse voxels, pruned and subdivided (NSVF, Liu et al. 2020), density
+asked first and color only where it counts (DVGO, Sun et al. 2022; Plenoxels, Fridovich-Keil et al. 2022), an occupancy
+grid with early termination (instant-ngp, Mueller et al. 2022), a visual hull (VaxNeRF, Kondo et al. 2021).
+
+h      size of a cell of the finest level, world units
+raw    logarithm of the optical depth across h: it can never make the density 0, so nothing can die
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from functools import cache
+from importlib.util import find_spec
+from types import ModuleType
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.models import voxel_ops
+from edge_se_sampler.models.config import VoxelModelConfig
+from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
+from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Samples
+from edge_se_sampler.occupancy.bricks import BrickGrid, dilate
+from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+
+FEATURE_DIM, WIDTH = 16, 64
+"""Features at a corner, and neurons of the hidden layer. The compiled kernels know no others."""
+INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
+"""Denser than the maximum is as opaque, and slow to become transparent again."""
+LAST_SUBDIVISION, LEVEL_RATIO = 0.4, 0.3
+"""Part of the training after which the finest level begins, and by which each level ends before the next one does."""
+UNSETTLED = 0.4
+"""Part of a level whose weights are not looked at when cells are pruned: they still move."""
+BYTES_PER_ROW = 4 * (3 * (FEATURE_DIM + 1) + 2) + 1
+"""Density, features, their two running means, and what the grid and the kernels keep of a row."""
+
+
+def choose_ops(weight: Tensor) -> ModuleType:
+    """What renders a model with such weights: `voxel_kernels` for float32 on a CPU where numba is installed, else plain
+    torch."""
+    return (weight.device.type == "cpu" and weight.dtype == torch.float32 and compiled_ops()) or voxel_ops
+
+
+@cache
+def compiled_ops() -> ModuleType | None:
+    """`voxel_kernels`; None without numba."""
+    if find_spec("numba") is None:
+        hint = 'pip install "edge-se-sampler[fast]" makes this model much faster on a CPU'
+        print(f"edge-se: numba is not installed; {hint}", file=sys.stderr)
+        return None
+    from edge_se_sampler.models import voxel_kernels
+
+    return voxel_kernels
+
+
+def compile_ops(device: str) -> None:
+    """Compile the kernels for models on a device, if there are any, and say how long it took if it took long: numba
+    keeps them for the next time."""
+    ops, began = device == "cpu" and compiled_ops(), time.monotonic()
+    if not ops:
+        return
+    grid, cells = BrickGrid(torch.zeros(3), 1.0, torch.ones((1, 1, 1), dtype=torch.bool), 1), torch.ones(1, 1, 1)
+    model = VoxelModel(VoxelModelConfig(size="tiny", near=0.0), np.random.default_rng(0), grid)
+    norm = {"directions_norm": torch.ones(1, 1)}
+    ray = RayBundle(torch.full((1, 3), 0.1), torch.full((1, 3), 3**-0.5), torch.zeros((1, 1), dtype=torch.int64), norm)
+    loss, _ = model.training_loss(ray, {"image": torch.rand(1, 4)})
+    loss.sum().backward()
+    for weight in (model.density, model.features):
+        rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
+        ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight), weight.grad, **rows)
+        ops.resample(grid.subdivide(cells.bool()).bricks, grid.numbers, weight.data)
+    if time.monotonic() - began > 5:
+        print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)
+
+
+class ColorNetwork(nn.Module):
+    """The weights of `voxel_ops.shade`'s network. `rng` draws the initial ones."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        super().__init__()
+
+        def draw(shape: tuple[int, int], variance: float) -> nn.Parameter:
+            return nn.Parameter(torch.from_numpy(rng.normal(size=shape) * math.sqrt(variance)).float())
+
+        self.hidden = draw((FEATURE_DIM, WIDTH), 2 / FEATURE_DIM)
+        self.view, self.view_bias = draw((NUM_HARMONICS, WIDTH), 0.5 / NUM_HARMONICS), nn.Parameter(torch.zeros(WIDTH))
+        self.color, self.color_bias = draw((3, WIDTH), 1 / WIDTH), nn.Parameter(torch.zeros(3))
+
+    def weights(self) -> NetworkWeights:
+        return NetworkWeights(self.hidden, self.view, self.view_bias, self.color, self.color_bias)
+
+
+class VoxelModel(RayModel):
+    """Sparse cells that training prunes and subdivides. `rng` draws the initial weights."""
+
+    config: VoxelModelConfig
+    grid: BrickGrid
+
+    def __init__(self, config: VoxelModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
+        super().__init__(config, grid)
+        self.fine = ColorNetwork(rng)
+        uncarved = grid.occupied.sum() > 0.9 * grid.size.prod()
+        across = float(grid.size.max()) * 2 ** int(grid.max_level)
+        raw = -math.log(across) if uncarved else INITIAL_RAW_DENSITY  # an uncarved box: optical depth 1 across
+        self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
+        draws = rng.standard_normal((grid.num_rows, FEATURE_DIM), dtype=np.float32) * np.float32(0.01)
+        self.features = nn.Parameter(torch.from_numpy(draws))
+
+    @property
+    def rays_per_chunk(self) -> int:
+        return 2**14
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The network; density and features learn faster, for each sees few samples."""
+        return [
+            ParameterGroup(list(self.fine.parameters())),
+            ParameterGroup([self.density], self.config.density_lr_scale, maximum=MAX_RAW_DENSITY),
+            ParameterGroup([self.features], self.config.feature_lr_scale, total_variation=self.config.total_variation),
+        ]
+
+    def forward(self, rays: RayBundle) -> dict[str, Tensor]:
+        """As `RayModel`; depth_fine in evaluation alone."""
+        return self._render(rays)[0]
+
+    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """As `RayModel`; remembers the largest weight in each cell."""
+        outputs, samples, weight = self._render(rays)
+        if self.grid.level < self.grid.max_level:
+            self.grid.update_max_weight(samples.rows[samples.colored, 0].long(), weight)
+        return self.loss(outputs, batch)
+
+    def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """As `RayModel`; plus, where there is alpha, the squared error of the accumulated opacity."""
+        loss, error = super().loss(outputs, batch)
+        if self.config.alpha_loss and batch["image"].shape[1] == 4:
+            difference = outputs["accumulation_fine"][:, 0] - batch["image"][:, 3]
+            loss = loss + self.config.alpha_loss / 3 * batch.get("weight", 1.0) * difference.square()
+        return loss, error
+
+    def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Samples, Tensor]:
+        """Outputs of `forward`, samples, and the weights of those that have a color."""
+        ops, config, grid = choose_ops(self.density), self.config, self.grid
+        cell_size, finest = float(grid.cell_size), float(grid.finest_size)
+        step = config.step_size_voxels
+        thresholds = config.alpha_threshold, config.weight_threshold, config.transmittance_threshold
+        marching = Marching(step, step * cell_size / finest, *thresholds)
+        spans, jitter = self._spans(rays), self.uniform(len(rays), 1)[:, 0] if self.training else None
+        samples = ops.march(grid, self.density, spans, jitter, marching)
+        raw = ops.interpolate(self.density, samples.rows, samples.weights)
+        tau = torch.exp(raw[:, 0]) * marching.density_scale
+        colored = samples.colored
+        features = ops.interpolate(self.features, samples.rows[colored], samples.weights[colored])
+        color = ops.shade(features, rays.directions, samples.ray_indices[colored], self.fine.weights())
+        rgb, accumulation, weight = ops.composite(tau, color, samples, len(rays))
+        background = self.get_background(rays)
+        outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}
+        if not self.training:
+            distance = samples.t[colored] * weight * cell_size
+            depth = torch.zeros_like(accumulation).index_add_(0, samples.ray_indices[colored], distance[:, None])
+            outputs["depth_fine"] = depth + (1 - accumulation) * config.far * rays.metadata["directions_norm"]
+        return outputs | {"background": background}, samples, weight
+
+    def _spans(self, rays: RayBundle) -> RaySpans:
+        """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it."""
+        cell_size = self.grid.cell_size
+        origins = ((rays.origins - self.grid.aabb_min) / cell_size).to(self.dtype)
+        inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
+        one, other = -origins * inverse, (self.grid.size - origins) * inverse
+        norm = rays.metadata["directions_norm"][:, 0] / float(cell_size)
+        begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
+        end = torch.maximum(one, other).amin(dim=1)
+        return RaySpans(
+            origins,
+            rays.directions,
+            torch.maximum(begin, self.config.near * norm),
+            torch.minimum(end, self.config.far * norm),
+        )
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Prunes and subdivides cells, by the part of the training that is done."""
+        trainer = attributes.trainer
+
+        def update_cells(step: int) -> None:
+            self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step))
+
+        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], update_cells)]
+
+    @torch.no_grad()
+    def update_cells(self, before: float, now: float) -> None:
+        """Do what is due as training goes on from one part of it to the next, both in [0, 1]."""
+        grid = self.grid
+        begin, end = self._level_span()
+        if before < begin + UNSETTLED * (end - begin) <= now:
+            grid.reset_max_weight()
+        # before that many weights are seen, nobody knows which cells are empty
+        if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
+            self._subdivide()
+
+    def _level_span(self) -> tuple[float, float]:
+        """Parts of the training at which the grid's level begins and ends."""
+        remaining = int(self.grid.max_level - self.grid.level)
+        begin, end = (LAST_SUBDIVISION * LEVEL_RATIO ** (levels - 1) for levels in (remaining + 1, remaining))
+        return begin if self.grid.level else 0.0, end if remaining else 1.0
+
+    def _find_seen(self) -> Tensor:
+        """(X, Y, Z) bool: cells that had a weight in some color. FloatingPointError: there are none."""
+        seen = self.grid.occupied.reshape(-1) & (self.grid.max_weight > self.config.prune_weight)
+        if not seen.any():
+            raise FloatingPointError("no cell has anything in it any more; try a lower --optimizer.lr, or a longer run")
+        return self.grid.to_cells(seen)
+
+    def _subdivide(self) -> None:
+        """Subdivide the cells that were seen, and those around them, unless that would take too much memory."""
+        occupied = self.grid.to_cells(self.grid.occupied.reshape(-1))
+        finer = self.grid.subdivide(dilate(self._find_seen()) & occupied)
+        if finer.num_rows * BYTES_PER_ROW > self.config.max_memory * 2**30:
+            self.grid.max_level.copy_(self.grid.level)
+            return
+        for parameter in (self.density, self.features):
+            parameter.grad = None
+            parameter.data = choose_ops(self.density).resample(finer.bricks, self.grid.numbers, parameter.data)
+        self.grid = finer

@@ -1,0 +1,211 @@
+"""The compiled kernels against their reference in plain torch: samples, values, gradients, steps of Adam, trainings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numba
+import numpy as np
+import pytest
+import torch
+from tiny import ball_views, tiny_trainer
+
+from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
+from edge_se_sampler.methods import method_configs
+from edge_se_sampler.models import voxel_kernels, voxel_ops, voxels
+from edge_se_sampler.models.config import VoxelModelConfig
+from edge_se_sampler.models.voxel_kernels import marching as marching_kernels
+from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Samples
+from edge_se_sampler.models.voxels import VoxelModel
+from edge_se_sampler.occupancy.bricks import BrickGrid
+
+MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01)
+VIEWS = ball_views()
+
+
+def shell(size: int = 40) -> BrickGrid:
+    """Cells between two spheres, with holes."""
+    middle = torch.arange(size) + 0.5 - size / 2
+    radius = torch.stack(torch.meshgrid(middle, middle, middle, indexing="ij")).norm(dim=0)
+    holes = torch.from_numpy(np.random.default_rng(1).random((size,) * 3) < 0.1)
+    return BrickGrid(torch.zeros(3), 1.0, (radius < size / 2.2) & (radius > size / 4) & ~holes)
+
+
+def crossing_spans(count: int = 300, size: int = 40) -> RaySpans:
+    """Rays from outside through the box; some along an axis, some that miss all cells."""
+    rng = np.random.default_rng(2)
+    origins = rng.normal(size=(count, 3))
+    origins = size / 2 + 2 * size * origins / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.uniform(0, size, (count, 3)) - origins
+    origins[:2], directions[:2] = ((size / 2, size / 2 + 0.3, -5), (9.5, size + 7, 20.5)), ((0, 0, 1), (0, -1, 0))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    with np.errstate(divide="ignore"):
+        one, other = -origins / directions, (size - origins) / directions
+    begin, end = np.minimum(one, other).max(axis=1).clip(min=0), np.maximum(one, other).min(axis=1)
+    return RaySpans(*(torch.from_numpy(value).float() for value in (origins, directions, begin, end)))
+
+
+def random_tensor(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).normal(size=shape)).float()
+
+
+def march(ops: ModuleType, marching: Marching = MARCHING) -> tuple[Samples, torch.Tensor]:
+    grid = shell()
+    density = random_tensor(grid.num_rows, 1) * 2 - 1
+    jitter = torch.from_numpy(np.random.default_rng(4).random(300)).float()
+    return ops.march(grid, density, crossing_spans(), jitter, marching), density
+
+
+def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-4) -> None:
+    """Equal to a part of the largest value."""
+    assert found.shape == expected.shape
+    assert float((found - expected).abs().max()) <= tolerance * float(expected.abs().max())
+
+
+@pytest.mark.parametrize("step", [0.3, 1.0, 2.5])
+def test_marching_finds_the_same_samples(step: float) -> None:
+    marching = replace(MARCHING, step=step)
+    (found, _), (expected, _) = march(voxel_kernels, marching), march(voxel_ops, marching)
+    assert len(expected.t) > 500
+    assert len(expected.colored) < len(expected.t)
+    for name, value in vars(expected).items():
+        assert torch.equal(getattr(found, name), value), name
+
+
+def test_rays_end_where_no_light_passes() -> None:
+    lengths = [len(march(voxel_kernels, replace(MARCHING, transmittance_min=least))[0].t) for least in (0.0, 0.01, 0.5)]
+    assert lengths[0] > 1.1 * lengths[1] > 1.2 * lengths[2]
+
+
+def test_more_samples_than_were_made_room_for_are_found_in_a_second_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = march(voxel_kernels)
+    monkeypatch.setattr(marching_kernels, "SAMPLES_PER_RAY", 1)
+    again, _ = march(voxel_kernels)
+    for name, value in vars(whole).items():
+        assert torch.equal(getattr(again, name), value), name
+
+
+def gradients_of(ops: ModuleType) -> dict[str, torch.Tensor]:
+    """Colors, and gradients of everything that is trained, sparse ones made dense."""
+    samples, density = march(ops)
+    model = VoxelModel(VoxelModelConfig(size="tiny"), np.random.default_rng(0), shell())
+    weights = model.fine.weights()
+    features = torch.nn.Parameter(random_tensor(len(density), 16, seed=5))
+    raw = torch.nn.Parameter(density)
+    tau = torch.exp(ops.interpolate(raw, samples.rows, samples.weights)[:, 0])
+    colored = samples.colored
+    x = ops.interpolate(features, samples.rows[colored], samples.weights[colored])
+    color = ops.shade(x, crossing_spans().directions, samples.ray_indices[colored], weights)
+    rgb, accumulation, weight = ops.composite(tau, color, samples, 300)
+    wanted = random_tensor(300, 4, seed=6)
+    (rgb * wanted[:, :3]).sum().add((accumulation * wanted[:, 3:]).sum()).backward()
+    named = {"density": raw, "features": features, **dict(model.fine.named_parameters())}
+    gradients = {name: value.grad for name, value in named.items()}
+    assert gradients["density"].is_sparse  # pyright: ignore
+    dense = {name: grad.to_dense() for name, grad in gradients.items() if grad is not None}
+    assert dense.keys() == named.keys()
+    return dense | {"rgb": rgb.detach(), "accumulation": accumulation.detach(), "weight": weight}
+
+
+def test_colors_and_gradients_are_the_reference_s() -> None:
+    found, expected = gradients_of(voxel_kernels), gradients_of(voxel_ops)
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert float(value.abs().max()) > 1e-3, name
+        assert_close(found[name], value)
+
+
+def test_any_number_of_threads_finds_the_same_bits() -> None:
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        one = gradients_of(voxel_kernels)
+        numba.set_num_threads(threads)
+        for name, value in gradients_of(voxel_kernels).items():
+            assert torch.equal(one[name], value), name
+    finally:
+        numba.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
+def test_a_step_of_adam_moves_the_rows_of_the_gradient_alone(ops: ModuleType) -> None:
+    """Twice, and with a row that occurs twice; the largest allowed value is kept."""
+    values, mean, square = random_tensor(128, 16), torch.zeros(128, 16), torch.zeros(128, 16)
+    expected = values.double().clone()
+    m, v = torch.zeros_like(expected), torch.zeros_like(expected)
+    for seed in (1, 2):
+        rows, sums = torch.tensor([70, 3, 127, 3]), random_tensor(4, 16, seed=seed)
+        gradient = torch.sparse_coo_tensor(rows[None], sums, (128, 16), check_invariants=True)
+        dense = gradient.to_dense().double()
+        settings = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-8, "maximum": 1.0, "total_variation": 0.5}
+        ops.adam_rows(values, mean, square, gradient, **settings)
+        for row in (3, 70, 127):
+            x, y, z = row % 64 // 16, row // 4 % 4, row % 4
+            near = [row + s * d for s, p in ((16, x), (4, y), (1, z)) for d in (-1, 1) if 0 <= p + d < 4]
+            dense[row] += 0.5 * sum(expected[row] - expected[other] for other in near)
+        before = expected.clone()
+        for row in (3, 70, 127):
+            m[row] = 0.9 * m[row] + 0.1 * dense[row]
+            v[row] = 0.99 * v[row] + 0.01 * dense[row] ** 2
+            expected[row] = (before[row] - 0.1 * m[row] / (v[row].sqrt() + 1e-8)).clamp(max=1.0)
+        torch.testing.assert_close(values.double(), expected, rtol=1e-5, atol=1e-5)
+        expected = values.double().clone()
+
+
+@pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
+def test_finer_corners_have_the_values_around_them(ops: ModuleType) -> None:
+    """A linear field, sampled at the corners, is the same field at the corners of half the size."""
+    grid = shell()
+    in_brick = torch.cartesian_prod(*[torch.arange(4)] * 3)
+
+    def field(of: BrickGrid) -> torch.Tensor:
+        position = (4 * of.bricks[:, None] + in_brick).reshape(-1, 3) * float(of.cell_size)
+        return torch.cat((position @ random_tensor(3, 1), position.float()), dim=1)
+
+    finer = grid.subdivide(grid.to_cells(grid.occupied.reshape(-1)))
+    found = ops.resample(finer.bricks, grid.numbers, field(grid).float())
+    brick, cell = torch.nonzero(finer.occupied, as_tuple=True)
+    rows = finer.corner_rows(brick, cell).unique()
+    torch.testing.assert_close(found[rows], field(finer).float()[rows], rtol=1e-5, atol=1e-5)
+
+
+COMPILED = """
+from numba.core.registry import CPUDispatcher
+from edge_se_sampler.models import voxels
+from edge_se_sampler.models.voxel_kernels import compositing, marching, rows, shading
+
+def signatures():
+    functions = [f for m in (compositing, marching, rows, shading) for f in vars(m).values()]
+    return {f.py_func.__name__: len(f.signatures) for f in functions if isinstance(f, CPUDispatcher)}
+
+voxels.compile_ops("cpu")
+compiled = signatures()
+from test_voxel_model import config_of, steps_of, VIEWS
+from tiny import tiny_trainer
+steps_of(tiny_trainer(config_of(30), VIEWS), 30)
+assert signatures() == compiled, (compiled, signatures())
+"""
+
+
+def test_nothing_is_left_to_compile_when_the_clock_runs() -> None:
+    subprocess.run([sys.executable, "-c", COMPILED], check=True, cwd=Path(__file__).parent)
+
+
+def losses(ops: ModuleType, monkeypatch: pytest.MonkeyPatch, steps: int = 50) -> list[float]:
+    monkeypatch.setattr(voxels, "compiled_ops", lambda: ops)
+    config: TrainerConfig = method_configs()["voxel-nerf"]
+    changes = {f"{MANAGER}.train_num_rays_per_batch": 64, f"{MODEL}.voxel_size_px": 0.5}
+    trainer = tiny_trainer(override(config, changes | {"max_num_iterations": steps}), VIEWS)
+    found = [trainer.train_iteration(step) for step in range(steps)]
+    assert int(trainer.pipeline.model.grid.level) == 2
+    return found
+
+
+def test_a_training_has_the_losses_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, expected = losses(voxel_kernels, monkeypatch), losses(voxel_ops, monkeypatch)
+    assert expected[-1] < expected[0] / 2
+    assert found == pytest.approx(expected, rel=1e-3)
