@@ -18,6 +18,7 @@ from edge_se_sampler.methods import registered_methods
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exit code 2 for bad input, 1 for a training that diverged, 130 for Ctrl-C."""
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's, before it is imported: large pages for large tensors
     try:
         try:
             _run(list(sys.argv[1:] if arguments is None else arguments))

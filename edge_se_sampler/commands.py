@@ -269,7 +269,7 @@ def train(trainer: Any) -> None:
     if trainer.stop_requested:
         print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
         sys.exit(130)
-    print(f"{trainer.next_step} of {trainer.planned_steps} iterations in {trainer.elapsed:.1f} s of training")
+    print(f"{trainer.next_step} of {trainer.plan.num_steps or '?'} iterations in {trainer.elapsed:.1f} s of training")
     print(f"measure it: edge-se eval {trainer.run.path}")
-    if trainer.next_step < trainer.planned_steps:
+    if trainer.next_step != trainer.plan.num_steps:
         print(f"continue:   {resume}")

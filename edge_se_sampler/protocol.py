@@ -103,6 +103,10 @@ class CallbackTrainer(Protocol):
     config: Any
     """The run's settings; `config.machine.seed` among them."""
 
+    def progress(self, step: int) -> float:
+        """The part of the training, in [0, 1], that is done when a step begins."""
+        ...
+
 
 @dataclass(frozen=True)
 class TrainingCallbackAttributes:

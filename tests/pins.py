@@ -65,7 +65,7 @@ def train(method: str, scene: Path, output_dir: Path) -> dict[str, Any]:
         run = RunFolder(trainer.run.path)
         loaded, checkpoint = load_model(run, run.config(method_configs()))
         assert checkpoint == latest_checkpoint(trainer.run.checkpoints)
-        assert digest(weights) == digest(weight for group, _ in loaded.parameter_groups() for weight in group)
+        assert digest(weights) == digest(weight for group in loaded.parameter_groups() for weight in group.parameters)
         return {
             "weights": digest(weights),
             "losses": [line["loss"] for line in trainer.run.metrics() if "loss" in line][:3],

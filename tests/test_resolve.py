@@ -70,7 +70,9 @@ def test_nothing_is_left_open(size: Any) -> None:
         nested = [name for value in fields.values() if dataclasses.is_dataclass(value) for name in left_open(value)]
         return nested + [name for name, value in fields.items() if value is None or value == "auto"]
 
-    assert left_open(resolved) == ["device_type", "data", "num_views", "views", "max_seconds"]
+    assert left_open(resolved) == [
+        *("device_type", "data", "num_views", "views", "time_budget", "segments", "max_seconds")
+    ]
     assert (
         resolve_config(resolved, of_size(800, 800)) == resolved
     )  # planning what is planned changes nothing, whatever the data
@@ -106,7 +108,7 @@ def test_the_given_config_is_not_changed() -> None:
     config = TrainerConfig()
     resolve_config(config, of_size(8, 8))
     assert config == TrainerConfig()
-    assert config.pipeline.model.width is None
+    assert config.pipeline.datamanager.train_num_rays_per_batch is None
 
 
 def test_the_experiment_is_named_after_the_data(tmp_path: Path) -> None:

@@ -10,10 +10,14 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_trainer, tiny_views
 
+from edge_se_sampler.engine import optimizers
 from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
-from edge_se_sampler.engine.trainer import Trainer, create_adam
+from edge_se_sampler.engine.optimizers import create_adam
+from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import nerf as model_module
+from edge_se_sampler.models.config import NERF_PRESETS, SizePreset
+from edge_se_sampler.models.ray_model import ParameterGroup
 
 VIEWS = tiny_views(3, 12, 12)
 RAYS = 37
@@ -25,6 +29,10 @@ def trainer_of(method: str = "edge-se-nerf", steps: int = 20, optimizer: Any = N
     pipeline = replace(config.pipeline, datamanager=manager, model=tiny_config(**model))
     optimizer = OptimizerConfig(lr=1e-2) if optimizer is None else optimizer
     return tiny_trainer(replace(config, pipeline=pipeline, max_num_iterations=steps, optimizer=optimizer), VIEWS)
+
+
+def preset(learning_rate: float) -> SizePreset:
+    return replace(NERF_PRESETS["tiny"], learning_rate=learning_rate)
 
 
 def gradients(trainer: Trainer) -> torch.Tensor:
@@ -105,7 +113,9 @@ def test_the_learning_rate_decays_to_its_final_fraction() -> None:
 
 def test_groups_of_weights_have_their_own_learning_rates() -> None:
     network, features = torch.nn.Parameter(torch.ones(3)), torch.nn.Parameter(torch.ones(2))
-    optimizer = create_adam([([network], 1.0), ([features], 6.0)], 0.01, OptimizerConfig())
+    optimizer = create_adam(
+        [ParameterGroup([network]), ParameterGroup([features], 6.0)], preset(0.01), OptimizerConfig()
+    )
     assert [group["lr"] for group in optimizer.param_groups] == [0.01, pytest.approx(0.06)]
 
 
@@ -145,16 +155,16 @@ def test_a_loss_that_is_not_finite_raises_before_the_weights_change() -> None:
 
 @pytest.mark.parametrize("supported", [True, False])
 def test_fused_adam_where_torch_supports_it(supported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    adam = torch.optim.Adam
+    adam = optimizers.RowAdam
 
     def old(*arguments: Any, **settings: Any) -> torch.optim.Adam:
         if settings.get("fused") and not supported:
             raise RuntimeError("`fused=True` requires all the params to be floating point Tensors of supported devices")
         return adam(*arguments, **settings)
 
-    monkeypatch.setattr(torch.optim, "Adam", old)
+    monkeypatch.setattr(optimizers, "RowAdam", old)
     weight = torch.nn.Parameter(torch.ones(3))
-    optimizer = create_adam([([weight], 1.0)], 1e-3, OptimizerConfig(eps=1e-9, fused=True))
+    optimizer = create_adam([ParameterGroup([weight])], preset(1e-3), OptimizerConfig(eps=1e-9, fused=True))
     assert bool(optimizer.defaults["fused"]) == supported
     assert optimizer.defaults["eps"] == 1e-9
-    assert not create_adam([([weight], 1.0)], 1e-3, OptimizerConfig()).defaults["fused"]
+    assert not create_adam([ParameterGroup([weight])], preset(1e-3), OptimizerConfig()).defaults["fused"]

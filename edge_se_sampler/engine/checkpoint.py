@@ -11,7 +11,7 @@ import hashlib
 import io
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
@@ -24,15 +24,44 @@ NAMES = f"step-{9 * '[0-9]'}*.ckpt"
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
     """Write the checkpoint after a step (0, 1, ...), then delete the older ones; InputError if it cannot be written."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    payload = buffer.getvalue()
     path = folder / f"step-{step:09d}.ckpt"
-    write_atomically(path, MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
+    write_atomically(path, lambda file: _write(state, file))
     for other in folder.glob(NAMES):
         if _step_of(other) < step:
             other.unlink(missing_ok=True)
     return path
+
+
+class _HashingWriter(io.RawIOBase):
+    """Passes on what is written, and hashes it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.digest = hashlib.sha256()
+        self.problem: OSError | None = None
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self.digest.update(data)
+        try:
+            return self._file.write(data)
+        except OSError as problem:
+            self.problem = problem
+            raise
+
+
+def _write(state: dict[str, Any], file: BinaryIO) -> None:
+    """The checkpoint's line and bytes, without a copy of these in memory: the line is written last."""
+    file.write(MAGIC + b"0" * 64 + b"\n")
+    writer = _HashingWriter(file)
+    try:
+        torch.save(state, writer)  # pyright: ignore[reportArgumentType]
+    except RuntimeError as problem:  # torch's name for a write that failed
+        raise writer.problem or problem from None
+    file.seek(len(MAGIC))
+    file.write(writer.digest.hexdigest().encode())
 
 
 def latest_checkpoint(folder: Path) -> Path:

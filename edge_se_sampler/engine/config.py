@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,8 +12,16 @@ import tyro
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.models.config import INFINITY, LeanModelConfig, ModelConfig, NeRFModelConfig, SizePreset
+from edge_se_sampler.models.config import (
+    INFINITY,
+    LeanModelConfig,
+    ModelConfig,
+    NeRFModelConfig,
+    SizePreset,
+    VoxelModelConfig,
+)
 from edge_se_sampler.protocol import InstantiateConfig
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,10 @@ class OptimizerConfig:
     """Learning rate at the end of the planned iterations, as a share of the initial one."""
     eps: float = 1e-8
     """Adam's epsilon."""
+    beta2: float = 0.999
+    """Adam's decay of the running mean of squared gradients."""
+    warmup_steps: int = 0
+    """Iterations over which the learning rate rises at first."""
     fused: bool = False
     """Use torch's fused implementation: faster, and rounded a little differently."""
 
@@ -69,6 +82,11 @@ class TrainerConfig(InstantiateConfig):
     """Name of the experiment; by default the data folder's name."""
     max_num_iterations: int | None = None
     """Planned iterations, which determine phases and learning rate; by default the model size's."""
+    time_budget: str | None = None
+    """Train for so long (60, 90s, 10m, 1h) in place of a number of iterations: phases and learning rate follow the
+    clock (voxel-nerf)."""
+    segments: tuple[int, ...] | None = None
+    """Iterations of each hundredth of the training; config.json has those of a run with a time budget, to repeat it."""
     max_seconds: float | None = None
     """Stop after so many seconds, even if iterations are left."""
     steps_per_save: int = 1000
@@ -89,6 +107,16 @@ class TrainerConfig(InstantiateConfig):
         rays = self.pipeline.datamanager.train_num_rays_per_batch
         given = {"learning_rate": self.optimizer.lr, "rays": rays, "iterations": self.max_num_iterations}
         return self.pipeline.model.preset.overridden_by(given)
+
+    @property
+    def budget_seconds(self) -> float | None:
+        """The time budget; InputError if it is none."""
+        if self.time_budget is None:
+            return None
+        match = re.fullmatch(r"(\d+(?:\.\d*)?) *([smh]?)", self.time_budget.strip())
+        seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
+        check_value("time-budget", self.time_budget, seconds > 0, "seconds above 0, or 10m, or 1h")
+        return seconds
 
     @property
     def preview_interval(self) -> int:
@@ -113,21 +141,38 @@ class TrainerConfig(InstantiateConfig):
         for name in (self.method_name, self.experiment_name):
             if name in ("", ".", "..") or "/" in str(name) or "\0" in str(name):
                 raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")
+        self.check_plan()
         lr, final = optimizer.lr, optimizer.final_fraction
         check_value("optimizer.lr", lr, lr is None or 0 < lr < INFINITY, "above 0")
         check_value("optimizer.final-fraction", final, 0 < final <= 1, "in (0, 1]")
         check_value("optimizer.eps", optimizer.eps, 0 <= optimizer.eps < INFINITY, "at least 0")
+        check_value("optimizer.beta2", optimizer.beta2, 0 <= optimizer.beta2 < 1, "in [0, 1)")
+        check_value("optimizer.warmup-steps", optimizer.warmup_steps, optimizer.warmup_steps >= 0, "at least 0")
         model.check("pipeline.model.")
         if manager.skip_empty_rays and not model.needs_grid:
             remedy = "add --pipeline.model.empty-space-skipping True"
             raise InputError(f"--pipeline.datamanager.skip-empty-rays has no effect here; {remedy}")
-        if not isinstance(model, LeanModelConfig):
+        if not isinstance(model, LeanModelConfig | VoxelModelConfig):
             return
         if self.reinit_dead:
             raise InputError("--reinit-dead: this model's density is never 0, it cannot die; leave the flag out")
         if getattr(manager.pixel_sampler, "error_source", "fine") == "coarse":
             flag = "--pipeline.datamanager.pixel-sampler.error-source"
             raise InputError(f"{flag} is coarse: this model has no coarse network")
+
+    def check_plan(self) -> None:
+        """Raise InputError if what is set of the run's length has no meaning."""
+        given = self.budget_seconds is not None or self.segments is not None
+        if given and not isinstance(self.pipeline.model, VoxelModelConfig):
+            raise InputError(f"--time-budget and --segments: {self.method_name} cannot follow them; use voxel-nerf")
+        if given and self.max_num_iterations is not None:
+            raise InputError("--max-num-iterations and --time-budget or --segments: give one of them")
+        sampler = self.pipeline.datamanager.pixel_sampler
+        early = isinstance(sampler, SamplingSettings) and (sampler.early, sampler.schedule)
+        if given and early in (("edge", "fraction"), ("precrop", "fraction")):
+            raise InputError(f"--{SAMPLER.replace('_', '-')}.schedule fraction needs a number of iterations; use steps")
+        valid = self.segments is None or (len(self.segments) == 100 and min(self.segments) >= 0 < sum(self.segments))
+        check_value("segments", self.segments, valid, "100 numbers of iterations, not all of them 0")
 
 
 @dataclass(frozen=True)

@@ -5,21 +5,23 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file's content and flush it to the disk; on failure leave the file as it was."""
+def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) -> None:
+    """Replace a file's content, by bytes or by what writes it, and flush it to the disk; on failure leave the file as
+    it was."""
     temporary = path.parent / f".{path.name}.tmp"
     with os_errors_as_input_errors(f"{path}: cannot be written, what was there before is untouched"):
         try:
             with open(temporary, "wb") as file:
-                file.write(content)
+                file.write(content) if isinstance(content, bytes) else content(file)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)

@@ -11,7 +11,7 @@ from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views
-from edge_se_sampler.models.config import LeanModelConfig, decide_size
+from edge_se_sampler.models.config import LeanModelConfig, VoxelModelConfig, decide_size
 from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.occupancy.hull import find_hit_pixels
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
@@ -44,6 +44,17 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, hit_pixels, config).items())
 
 
+def _describe_levels(views: Views, config: LeanModelConfig, footprint: float) -> str:
+    """The cells of voxel-nerf for the same depths."""
+    model = VoxelModelConfig(near=config.near, far=config.far)
+    analysis = analyze_views(views, model)
+    size, count = analysis.hull.cell_size, int(analysis.hull.cells.sum())
+    return (
+        f"begins with {count:,} cells of {size:.4f}, {size / footprint:.1f} pixels; what it sees is subdivided "
+        f"{analysis.max_level} times, to {model.voxel_size_px:g} pixels, in at most {model.max_memory:g} GiB"
+    )
+
+
 def _findings(
     views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
 ) -> dict[str, str]:
@@ -69,6 +80,7 @@ def _findings(
         "cells": f"{hull.cell_size:.4f} a side, {hull.cell_size / footprint:.1f} pixels; {num_occupied:,} of "
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)"
         + (f"; training begins with {first:.4f}, subdivided to {finest:.4f} if dense" if first > finest else ""),
+        "voxel-nerf": _describe_levels(views, config, footprint),
         "encoding": f"{preset.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; "
         f"what is finer is left to {config.feature_dim} features at every corner of a cell",
         "network": f"{preset.depth} x {preset.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size "

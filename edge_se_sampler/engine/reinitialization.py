@@ -13,6 +13,7 @@ import torch
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.rendering import render_rays
+from edge_se_sampler.models.config import FieldModelConfig
 from edge_se_sampler.models.field import NeRFField, initialize_linear
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.sampling.random_streams import Stream, stream
@@ -50,9 +51,11 @@ class DeadNetworkReset:
         return {name: self._reinitialize(getattr(self.model, name)) for name in dead}
 
     def _reinitialize(self, field: NeRFField) -> int:
+        config = self.model.config
+        assert isinstance(config, FieldModelConfig)
         self.used_sub_seeds += 1
         rng = stream(self.seed, self.used_sub_seeds, Stream.WEIGHTS)
-        initialize_linear(field, self.model.config.initialization, rng)
+        initialize_linear(field, config.initialization, rng)
         for weight in field.parameters():
             self.optimizer.state.pop(weight, None)
         return self.used_sub_seeds

@@ -34,8 +34,13 @@ class RunFolder:
             path = _new_folder(parent, time.strftime("%Y-%m-%d_%H%M%S"))
             (path / "checkpoints").mkdir()
             (path / "previews").mkdir()
-        write_json(path / "config.json", config_to_json(config))
-        return cls(path)
+        run = cls(path)
+        run.write_config(config)
+        return run
+
+    def write_config(self, config: TrainerConfig) -> None:
+        """Write config.json; InputError if that fails."""
+        write_json(self.path / "config.json", config_to_json(config))
 
     @property
     def checkpoints(self) -> Path:
@@ -124,6 +129,8 @@ def config_digest(config: TrainerConfig) -> str:
     values = config_to_json(config)
     for name in ("output_dir", "data", "max_seconds", "steps_per_save"):
         del values[name]
+    if config.time_budget is not None:
+        del values["segments"]  # known at the end only
     del values["machine"]["device_type"]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 

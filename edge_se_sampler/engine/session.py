@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,18 +18,18 @@ from edge_se_sampler.data.downscale import downscale
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
+from edge_se_sampler.engine.pipeline import Grid, Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.models.config import NeRFModelConfig, apply_preset, decide_size
+from edge_se_sampler.models.config import NeRFModelConfig, VoxelModelConfig, apply_preset, decide_size
 from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.models.voxels import compile_ops
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
-def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: OccupancyGrid | None = None) -> Trainer:
+def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: Grid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
     views, device = read_train_views(config), choose_device(config.machine.device_type)
@@ -36,22 +37,27 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: Occupancy
     preview = None if held_out is None else to_pictures(held_out)[0]
     config = resolve_config(config, views)
     disable_malloc_trimming()
+    if isinstance(config.pipeline.model, VoxelModelConfig):
+        compile_ops(device)
+    began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
-    return config.setup(run=run or RunFolder.create(config), pipeline=pipeline, preview=preview)
+    run = run or RunFolder.create(config)
+    return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=time.monotonic() - began)
 
 
 def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     """The config with nothing left open, its size decided by the training views; a resolved one stays as it is,
     whatever the views. InputError if a value is out of its range."""
+    config.check_plan()
     data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
     config = replace(config, pipeline=replace(config.pipeline, model=model))
-    preset = config.preset
+    preset, by_steps = config.preset, config.time_budget is None and config.segments is None
     resolved = replace(
         config,
         data=data,
         experiment_name=config.experiment_name or (data.name if data else "unnamed"),
-        max_num_iterations=preset.iterations,
-        steps_per_eval_image=config.preview_interval,
+        max_num_iterations=preset.iterations if by_steps else None,
+        steps_per_eval_image=config.preview_interval if by_steps else config.steps_per_eval_image,
         pipeline=replace(
             config.pipeline,
             datamanager=replace(config.pipeline.datamanager, train_num_rays_per_batch=preset.rays),
@@ -131,11 +137,18 @@ def describe_run(trainer: Trainer) -> str:
     samples = "samples in occupied cells"
     if isinstance(model, NeRFModelConfig):
         samples = f"{model.num_coarse_samples} + {model.num_importance_samples} samples a ray"
+    plan = f"{trainer.plan.num_steps} iterations" if config.time_budget is None else f"{config.budget_seconds:.0f} s"
     lines = [
         f"run      {trainer.run.path}",
-        f"model    {model.size}: {model.depth} x {model.width}, {samples}",
-        f"plan     {config.max_num_iterations} iterations of {manager.train_num_rays_per_batch} rays",
+        f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
+        f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",
     ]
+    if isinstance(model, VoxelModelConfig):
+        grid = trainer.pipeline.model.grid
+        lines.append(
+            f"cells    {int(grid.occupied.sum()):,} of {float(grid.cell_size):.4f} a side, to be subdivided "
+            f"{int(grid.max_level - grid.level)} times in at most {model.max_memory:g} GiB"
+        )
     if isinstance(sampler, SamplingSettings):
         until = "until the object is learned"
         if sampler.schedule != "adaptive":

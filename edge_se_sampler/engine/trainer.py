@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,9 +16,11 @@ from torch.optim.lr_scheduler import LambdaLR
 from tqdm import tqdm
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
-from edge_se_sampler.engine.config import OptimizerConfig, TrainerConfig
+from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import write_image
+from edge_se_sampler.engine.optimizers import create_adam
 from edge_se_sampler.engine.pipeline import Pipeline, load_weights
+from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
@@ -27,19 +30,31 @@ from edge_se_sampler.sampling.random_streams import Stream, stream
 
 
 class Trainer:
-    """Trains a model into a run folder by a resolved config; `preview` is a held-out view, rendered now and then."""
+    """Trains a model into a run folder by a resolved config; `preview` is a held-out view, rendered now and then. Of a
+    time budget, `setup_seconds` have passed."""
 
-    def __init__(self, config: TrainerConfig, *, run: RunFolder, pipeline: Pipeline, preview: Picture | None) -> None:
+    def __init__(
+        self,
+        config: TrainerConfig,
+        *,
+        run: RunFolder,
+        pipeline: Pipeline,
+        preview: Picture | None,
+        setup_seconds: float = 0.0,
+    ) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
+        self.plan = Plan(config.max_num_iterations, config.segments or (), config.budget_seconds)
+        self.setup_seconds = setup_seconds
         self.planned_steps = config.preset.iterations
-        self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset.learning_rate, config.optimizer)
-        decay = config.optimizer.final_fraction
-        self.scheduler = LambdaLR(self.optimizer, lambda step: decay ** (step / self.planned_steps))
+        self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset, config.optimizer)
+        self.scheduler = LambdaLR(self.optimizer, self._learning_rate_factor)
         self.next_step = 0
         self.elapsed = 0.0
         self.events = EventWriter(run.path)
         self.stop_requested = False
-        self.callbacks = pipeline.datamanager.get_training_callbacks(TrainingCallbackAttributes(pipeline, self))
+        attributes = TrainingCallbackAttributes(pipeline, self)
+        self.callbacks = pipeline.datamanager.get_training_callbacks(attributes)
+        self.callbacks += pipeline.model.get_training_callbacks(attributes)
         self.dead_network_reset: DeadNetworkReset | None = None
         if config.reinit_dead:
             seed = config.machine.seed
@@ -47,10 +62,20 @@ class Trainer:
             self.dead_network_reset = DeadNetworkReset(pipeline.model, self.optimizer, probe, seed)
         self._preview_psnr: float | None = None
 
+    def progress(self, step: int) -> float:
+        """The part of the training, in [0, 1], that is done when a step begins."""
+        return self.plan.progress(step)
+
+    def _learning_rate_factor(self, step: int) -> float:
+        decay, warmup = self.config.optimizer.final_fraction, self.config.optimizer.warmup_steps
+        return decay ** self.progress(step) * min(1.0, (step + 1) / (warmup + 1))
+
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint's state; InputError if it is another model's."""
         load_weights(self.pipeline.model, state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        if state["optimizer"] is not None:  # of a run that has ended
+            self.optimizer.load_state_dict(state["optimizer"])
+        self.plan.load_state_dict(state["plan"])
         self.scheduler.load_state_dict(state["scheduler"])
         if self.dead_network_reset is not None:
             self.dead_network_reset.load_state_dict(state["dead_network_reset"])
@@ -64,25 +89,32 @@ class Trainer:
         config = self.config
         began = time.monotonic() - self.elapsed
         deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds
-        with self._interruptible(), Progress(self.planned_steps, config.method_name, self.next_step) as progress:
-            while self.next_step < self.planned_steps:
+        plan = self.plan
+        plan.decide(self.next_step, self.setup_seconds + self.elapsed)
+        with self._interruptible(), Progress(plan.num_steps or 0, config.method_name, self.next_step) as progress:
+            while self.next_step != plan.num_steps:
                 step = self.next_step
                 learning_rate = float(self.scheduler.get_last_lr()[0])
                 loss = self.train_iteration(step)
                 self.next_step, self.elapsed = step + 1, time.monotonic() - began
-                ended = self.next_step == self.planned_steps
+                plan.decide(self.next_step, self.setup_seconds + self.elapsed)
+                ended = self.next_step == plan.num_steps
                 stop = ended or self.stop_requested or time.monotonic() >= deadline
                 if ended or step % config.steps_per_log == 0:
                     strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
                     self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
-                if ended or self.next_step % config.preview_interval == 0:
+                if ended or self._preview_is_due():
                     self._preview(step)
                     began = time.monotonic() - self.elapsed  # a preview is not training time
                 if stop or self.next_step % config.steps_per_save == 0:
                     self.save()
-                progress.update(self.next_step, note=self._status(loss))
+                total = plan.num_steps or round(self.next_step / max(plan.progress(self.next_step), 1e-3))
+                progress.update(self.next_step, total, note=self._status(loss))
                 if stop:
                     break
+        if plan.time_budget is not None and self.next_step == plan.num_steps:
+            self.config = replace(config, segments=tuple(plan.segments))
+            self.run.write_config(self.config)
         self.events.close()
 
     def train_iteration(self, step: int) -> float:
@@ -137,6 +169,7 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of the steps done so far; FloatingPointError, and no file, if a weight is not finite."""
         step = self.next_step - 1
+        ended = self.next_step == self.plan.num_steps
         if not all(torch.isfinite(weight).all() for weight in self.pipeline.model.parameters()):
             raise FloatingPointError(f"a weight is not finite after step {step}; try a lower --optimizer.lr")
         state = {
@@ -144,7 +177,8 @@ class Trainer:
             "elapsed": self.elapsed,
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "plan": self.plan.state_dict(),
+            "optimizer": None if ended else self.optimizer.state_dict(),  # as large as the model, twice
             "scheduler": self.scheduler.state_dict(),
             "dead_network_reset": None if self.dead_network_reset is None else self.dead_network_reset.state_dict(),
             "sampler": self.pipeline.datamanager.state_dict(),
@@ -155,6 +189,14 @@ class Trainer:
         line = {"step": step, **values, "seconds": round(self.elapsed, 3)}
         self.run.log(line)
         self.events.write(line)
+
+    def _preview_is_due(self) -> bool:
+        """Before `next_step`: at regular steps, or ten times in a time budget."""
+        interval = self.config.steps_per_eval_image
+        if interval is not None:
+            return self.next_step % interval == 0
+        before, now = (int(10 * self.progress(step)) for step in (self.next_step - 1, self.next_step))
+        return before < now
 
     def _preview(self, step: int) -> None:
         if self.preview_picture is not None:
@@ -182,14 +224,3 @@ class Trainer:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-
-
-def create_adam(
-    groups: list[tuple[list[torch.nn.Parameter], float]], learning_rate: float, config: OptimizerConfig
-) -> torch.optim.Adam:
-    """Adam over groups of weights, each with the scale of its learning rate."""
-    parts = [{"params": weights, "lr": learning_rate * scale} for weights, scale in groups]
-    if config.fused:
-        with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
-            return torch.optim.Adam(parts, eps=config.eps, fused=True)
-    return torch.optim.Adam(parts, eps=config.eps)

@@ -1,0 +1,69 @@
+"""Adam, which also takes the sparse gradients of tables of which a step touches few rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
+
+import torch
+
+from edge_se_sampler.engine.config import OptimizerConfig
+from edge_se_sampler.models.config import SizePreset
+from edge_se_sampler.models.ray_model import ParameterGroup
+from edge_se_sampler.models.voxels import choose_ops
+
+
+class RowAdam(torch.optim.Adam):
+    """torch's Adam; of weights that have a sparse gradient, only the rows that it has are moved, by Adam without bias
+    correction, and their running means are only then updated (as DVGO's and torch's SparseAdam do).
+
+    Groups may have `maximum`, the largest value of such rows, and `total_variation`, by which the differences between
+    a row and its neighbors in its brick count in its gradient.
+    """
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        for group in self.param_groups:
+            for weight in group["params"]:
+                if weight.grad is not None and weight.grad.is_sparse:
+                    self._step_rows(group, weight)
+                    weight.grad = None
+        return super().step(closure)
+
+    def _step_rows(self, group: dict[str, Any], weight: torch.Tensor) -> None:
+        state = self.state[weight]
+        if not state:
+            state["step"] = torch.tensor(0.0)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weight), torch.zeros_like(weight)
+        state["step"] += 1
+        choose_ops(weight).adam_rows(
+            weight,
+            state["exp_avg"],
+            state["exp_avg_sq"],
+            weight.grad,
+            lr=group["lr"],
+            betas=group["betas"],
+            eps=group["eps"],
+            maximum=group["maximum"],
+            total_variation=group["total_variation"],
+        )
+
+
+def create_adam(groups: Sequence[ParameterGroup], preset: SizePreset, config: OptimizerConfig) -> RowAdam:
+    """Adam over groups of weights, for the training that a preset without open numbers describes."""
+    parts = [
+        {
+            "params": group.parameters,
+            "lr": preset.learning_rate * group.lr_scale,
+            "maximum": group.maximum,
+            # the loss is a mean over rays and channels
+            "total_variation": group.total_variation / (3 * preset.rays),
+        }
+        for group in groups
+    ]
+    betas = (0.9, config.beta2)
+    if config.fused:
+        with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
+            return RowAdam(parts, betas=betas, eps=config.eps, fused=True)
+    return RowAdam(parts, betas=betas, eps=config.eps)
