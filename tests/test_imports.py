@@ -27,7 +27,7 @@ LAYERS = [
     ("cli",),
 ]
 """Files and folders of the package. Each may import from its own layer and from earlier ones."""
-HEAVY = {"torch", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio"}
+HEAVY = {"torch", "numba", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio"}
 
 
 def module_name(path: Path, root: Path) -> str:

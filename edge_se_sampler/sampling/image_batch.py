@@ -60,6 +60,10 @@ class ImageBatch:
         """(H, W) bool on the CPU: the pixels at position k that may be drawn."""
         return self.mask[k].reshape(self.sizes[k]).bool().cpu()
 
+    def is_valid(self, drawn: Tensor) -> Tensor:
+        """(n,) bool on the CPU: whether pixels (n, 3), position in the batch, row, column, may be drawn by the mask."""
+        return self._pick(self.mask, drawn.to(self.mask[0].device)).reshape(len(drawn)).bool().cpu()
+
     def gather(self, drawn: Tensor) -> dict[str, Any]:
         """Every per-pixel key at drawn pixels, and `indices` (n, 3) int64: absolute image number, row, column.
 

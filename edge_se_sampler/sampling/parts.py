@@ -96,6 +96,11 @@ class Distribution(SamplerPart, ABC):
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
         """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`."""
+        pixels = self.draw_pixels(batch, count, step)
+        return PixelBatch(batch, pixels, batch.gather(pixels), self)
+
+    def draw_pixels(self, batch: ImageBatch, count: int, step: TrainingStep) -> Tensor:
+        """What `draw` draws: (count, 3) int64 position in the batch, row, column."""
         rng = stream(step.seed, step.number, Stream.PIXELS)
         source, table_index, drawable = self.drawable(batch)
         if self.settings.images_per_step == "one":
@@ -103,7 +108,7 @@ class Distribution(SamplerPart, ABC):
         # strided: a table's draws come ordered by image
         pixels = source.draw(table_index[drawable], count * step.world, rng)[step.rank :: step.world]
         pixels[:, 0] = drawable[pixels[:, 0]]
-        return PixelBatch(batch, pixels, batch.gather(pixels), self)
+        return pixels
 
     def density_ratio(self, batch: ImageBatch, pixels: Tensor) -> Tensor:
         """p/u (n,) of pixels (n, 3): position in the batch, row, column."""
