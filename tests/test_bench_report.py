@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.bench.chart.report import tables
+from edge_se_sampler.bench.real import report as real
 from edge_se_sampler.bench.report import fill_template, report_of
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -23,7 +24,7 @@ def test_a_committed_readme_is_generated_from_its_results(folder: Path) -> None:
 
 def test_the_tables_of_the_main_readme_are_generated() -> None:
     readme = (CONFIGS.parent / "README.md").read_text()
-    for name, table in tables(CONFIGS / "chart").items():
+    for name, table in (tables(CONFIGS / "chart") | real.tables(CONFIGS / "real")).items():
         assert f"<!-- table: {name} -->\n{table}\n<!-- end -->" in readme
 
 

@@ -12,6 +12,7 @@ from edge_se_sampler.bench.chart.command import BenchChart
 from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring
 from edge_se_sampler.bench.nerfstudio.command import BenchNerfstudio
 from edge_se_sampler.bench.paper.command import BenchPaper
+from edge_se_sampler.bench.real.command import BenchReal
 from edge_se_sampler.bench.report import write_report
 from edge_se_sampler.bench.schedule.command import BenchSchedule
 from edge_se_sampler.bench.stability.command import BenchStability
@@ -41,6 +42,7 @@ BENCHES: dict[str, type] = {
     "stability": BenchStability,
     "schedule": BenchSchedule,
     "chart": BenchChart,
+    "real": BenchReal,
     "baselines": BenchBaselines,
     "report": BenchReport,
 }

@@ -1,0 +1,46 @@
+"""edge-se bench real. Torch-free until it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.runner import Experiment
+from edge_se_sampler.errors import InputError, check_known, check_value
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchReal(ExperimentCommand):
+    """Train voxel-nerf on real scenes with time budgets, one training at a time on all cores, and tabulate test PSNR.
+    Resumes."""
+
+    scenes_dir: Path
+    """Folder of Blender folders, such as those of NeRF-synthetic (lego, chair, ...) with their official splits."""
+    scenes: tuple[str, ...] = ("lego", "chair")
+    """Folders in it."""
+    downscales: tuple[int, ...] = (2,)
+    """Of NeRF's 800 x 800 pixels."""
+    budgets: tuple[str, ...] = ("1m", "3m")
+    """Time budgets, as in edge-se train."""
+    variants: tuple[str, ...] = ("voxel-nerf",)
+    """By their labels in the page; one thing is changed in each."""
+
+    def experiment(self) -> Experiment:
+        from edge_se_sampler.bench.real.trials import VARIANTS, Settings, Trial, run_trial
+
+        check_known("variants", self.variants, VARIANTS)
+        check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
+        for scene in self.scenes:
+            if not (self.scenes_dir / scene).is_dir():
+                raise InputError(
+                    f"--scenes-dir {self.scenes_dir}: has no folder {scene}; give the folder of the scenes"
+                )
+        every = product(self.seeds, self.downscales, self.budgets, self.scenes, self.variants)
+        trials = [Trial(scene, down, budget, variant, seed) for seed, down, budget, scene, variant in every]
+        settings, scenes_dir, workplace = Settings(), self.scenes_dir.resolve(), self.workplace.resolve()
+        return Experiment("real", settings, lambda _: trials, run_trial, lambda _: (scenes_dir, workplace, settings))
+
+    def default_workers(self) -> int:
+        return 1

@@ -1,0 +1,111 @@
+"""Trainings of voxel-nerf on real scenes, each with a time budget on all of the machine's cores."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_se_sampler.bench.machine import resident_memory
+from edge_se_sampler.bench.runner import Run, run_in_subprocess
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.downscale import downscale
+from edge_se_sampler.engine.config import MODEL, override
+from edge_se_sampler.engine.evaluation import evaluate
+from edge_se_sampler.engine.rendering import Picture, to_pictures
+from edge_se_sampler.engine.session import prepare, read_test_views
+from edge_se_sampler.methods import method_configs
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "voxel-nerf": {},
+    "no hull": {f"{MODEL}.cull_by_alpha": False},
+    "no total variation": {f"{MODEL}.total_variation": 0.0},
+    "no alpha loss": {f"{MODEL}.alpha_loss": 0.0},
+    "random background": {f"{MODEL}.background_color": "random"},
+    "half the thresholds": {
+        f"{MODEL}.alpha_threshold": 0.004,
+        f"{MODEL}.weight_threshold": 0.002,
+        f"{MODEL}.transmittance_threshold": 0.003,
+    },
+}
+"""What is changed, by label."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all trainings have in common."""
+
+    num_train_views: int = 5
+    """Training views that are measured, too, evenly spread."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training."""
+
+    scene: str
+    downscale: int
+    budget: str
+    variant: str
+    seed: int
+
+
+def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
+    """Train in a process of its own, and measure on test, validation and some training views.
+
+    Returns:
+        PSNR on each, SSIM on the test views; steps; seconds of the budget that were used, and CPU seconds; rows of the
+        finest cells; the process's peak of resident memory, GiB; seconds that rendering a test view takes.
+    """
+    return run_in_subprocess(_train_and_measure, trial, scenes, workplace, settings)
+
+
+def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
+    changes = {
+        "data": scenes / trial.scene,
+        "downscale": trial.downscale,
+        "time_budget": trial.budget,
+        "output_dir": workplace / "runs",
+        "machine.seed": trial.seed,
+        **VARIANTS[trial.variant],
+    }
+    with contextlib.redirect_stderr(io.StringIO()):
+        trainer = prepare(override(method_configs()["voxel-nerf"], changes))
+        start = time.process_time()
+        trainer.train()
+    cpu_seconds = time.process_time() - start
+    peak = resident_memory("VmHWM")
+    model, config = trainer.pipeline.model, trainer.config
+    pictures = to_pictures(read_test_views(config))
+    start = time.monotonic()
+    results = evaluate(model, pictures)
+    seconds_per_view = (time.monotonic() - start) / len(pictures)
+    return {
+        "psnr": round(results["psnr"], 3),
+        "ssim": round(results["ssim"], 4),
+        "val_psnr": _mean_psnr(model, _pictures(trial, scenes, "val")),
+        "train_psnr": _mean_psnr(model, _pictures(trial, scenes, "train", settings.num_train_views)),
+        "steps": trainer.next_step,
+        "seconds": round(trainer.elapsed + trainer.setup_seconds, 2),
+        "cpu_seconds": round(cpu_seconds, 2),
+        "level": int(model.grid.level),
+        "rows": model.grid.num_rows,
+        "memory": round(peak / 2**30, 2),
+        "seconds_per_view": round(seconds_per_view, 3),
+    }
+
+
+def _pictures(trial: Trial, scenes: Path, split: Any, count: int | None = None) -> list[Picture]:
+    views = read_blender(scenes / trial.scene, split)
+    if count is not None:
+        views = views.subset(np.linspace(0, len(views.names) - 1, count).astype(int).tolist())
+    return to_pictures(downscale(views, trial.downscale))
+
+
+def _mean_psnr(model: Any, pictures: list[Picture]) -> float:
+    return round(evaluate(model, pictures)["psnr"], 3)
