@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_se_sampler.occupancy.bricks import BRICK, MAX_DISTANCE, OFFSETS, BrickGrid, dilate
+from edge_se_sampler.occupancy.bricks import BRICK, MAX_DISTANCE, OFFSETS, BrickGrid, dilate, unpack_bits
 
 
 def random_cells(share: float = 0.02, shape: tuple[int, int, int] = (21, 9, 14)) -> torch.Tensor:
@@ -23,8 +23,9 @@ def test_rows_and_cells_are_the_same_cells(share: float) -> None:
     grid = grid_of(cells)
     assert torch.equal(grid.to_cells(grid.occupied.reshape(-1)), cells)
     assert int(grid.occupied.sum()) == int(cells.sum())
-    bits = torch.tensor([[(number >> i) & 1 for i in range(64)] for number in grid.bits.tolist()], dtype=torch.bool)
-    assert torch.equal(bits, grid.occupied)
+    bits = [[(number >> i) & 1 for i in range(64)] for number in grid.sampled.tolist()]
+    assert torch.equal(torch.tensor(bits, dtype=torch.bool), grid.occupied)
+    assert torch.equal(unpack_bits(grid.sampled), grid.occupied)
 
 
 def test_every_corner_of_an_occupied_cell_has_a_row_of_its_own() -> None:

@@ -21,7 +21,7 @@ from edge_se_sampler.models.config import VoxelModelConfig
 from edge_se_sampler.models.voxel_kernels import marching as marching_kernels
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Samples
 from edge_se_sampler.models.voxels import VoxelModel
-from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
 MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01)
 VIEWS = ball_views()
@@ -79,6 +79,23 @@ def test_marching_finds_the_same_samples(step: float) -> None:
 def test_rays_end_where_no_light_passes() -> None:
     lengths = [len(march(voxel_kernels, replace(MARCHING, transmittance_min=least))[0].t) for least in (0.0, 0.01, 0.5)]
     assert lengths[0] > 1.1 * lengths[1] > 1.2 * lengths[2]
+
+
+@pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
+def test_cells_that_are_too_thin_to_be_seen_need_not_be_sampled(ops: ModuleType) -> None:
+    grid, rays = shell(), (crossing_spans(), torch.full((300,), 0.3), MARCHING)
+    density = 2 * random_tensor(grid.num_rows, 1) - 7
+    samples = ops.march(grid, density, *rays)
+    dense = ops.find_dense_cells(grid, density, MARCHING.density_min)
+    corners = grid.corner_rows(*torch.nonzero(grid.occupied, as_tuple=True))
+    expected = torch.zeros_like(grid.occupied)
+    expected[grid.occupied] = (density[corners][..., 0] > np.log(-np.log(1 - 0.012))).any(dim=1)
+    assert torch.equal(unpack_bits(dense), expected)
+    assert 0.2 < float(expected.sum() / grid.occupied.sum()) < 0.9
+    grid.set_sampled(dense)
+    again = ops.march(grid, density, *rays)
+    assert len(again.t) > 20
+    assert torch.equal(again.t, samples.t)
 
 
 def test_more_samples_than_were_made_room_for_are_found_in_a_second_round(monkeypatch: pytest.MonkeyPatch) -> None:

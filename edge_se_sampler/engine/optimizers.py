@@ -13,6 +13,9 @@ from edge_se_sampler.models.config import SizePreset
 from edge_se_sampler.models.ray_model import ParameterGroup
 from edge_se_sampler.models.voxels import choose_ops
 
+TOTAL_VARIATION_INTERVAL = 4
+"""Steps between two that total variation counts in, by as much more: looking at all neighbors takes time."""
+
 
 class RowAdam(torch.optim.Adam):
     """torch's Adam; of weights that have a sparse gradient, only the rows that it has are moved, by Adam without bias
@@ -32,7 +35,7 @@ class RowAdam(torch.optim.Adam):
         return super().step(closure)
 
     def _step_rows(self, group: dict[str, Any], weight: torch.Tensor) -> None:
-        state = self.state[weight]
+        state, interval = self.state[weight], TOTAL_VARIATION_INTERVAL
         if not state:
             state["step"] = torch.tensor(0.0)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weight), torch.zeros_like(weight)
@@ -46,7 +49,7 @@ class RowAdam(torch.optim.Adam):
             betas=group["betas"],
             eps=group["eps"],
             maximum=group["maximum"],
-            total_variation=group["total_variation"],
+            total_variation=0.0 if state["step"] % interval else interval * group["total_variation"],
         )
 
 

@@ -10,13 +10,14 @@ T      transmittance: share of the light that passes all samples before one
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from edge_se_sampler.occupancy.bricks import BRICK, OFFSETS, BrickGrid
+from edge_se_sampler.occupancy.bricks import BRICK, OFFSETS, BrickGrid, pack_bits, unpack_bits
 
 NUM_HARMONICS = 16
 """Spherical harmonics up to degree 3."""
@@ -36,6 +37,11 @@ class Marching:
     """Samples of less weight have no color: black, at their full opacity."""
     transmittance_min: float
     """A ray ends where less light passes."""
+
+    @property
+    def density_min(self) -> float:
+        """Raw density of samples that are left out."""
+        return math.log(-math.log1p(-self.alpha_min) / self.density_scale) if self.alpha_min else -math.inf
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ class Samples:
 
 
 def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | None, marching: Marching) -> Samples:
-    """The samples of rays in occupied cells, as far as light passes.
+    """The samples of rays in the cells that are sampled, as far as light passes.
 
     Args:
         density: (64 K, 1) raw density at the corners.
@@ -82,12 +88,11 @@ def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | No
     ray, index, position, cell = ray[inside], index[inside], position[inside], cell[inside]
     brick = grid.table[tuple((cell // BRICK).T)].long()
     in_brick = (cell % BRICK * torch.tensor([BRICK * BRICK, BRICK, 1], device=cell.device)).sum(dim=1)
-    occupied = (brick >= 0) & grid.occupied[brick.clamp(min=0), in_brick]
-    ray, index, brick, in_brick = ray[occupied], index[occupied], brick[occupied], in_brick[occupied]
+    sampled = (brick >= 0) & unpack_bits(grid.sampled)[brick.clamp(min=0), in_brick]
+    ray, index, brick, in_brick = ray[sampled], index[sampled], brick[sampled], in_brick[sampled]
     rows = grid.corner_rows(brick, in_brick)
-    weights = corner_weights(position[occupied] - cell[occupied])
-    tau = torch.exp(interpolate(density, rows, weights)[:, 0]) * marching.density_scale
-    alpha = 1 - torch.exp(-tau)
+    weights = corner_weights(position[sampled] - cell[sampled])
+    alpha = 1 - torch.exp(-torch.exp(interpolate(density, rows, weights)[:, 0]) * marching.density_scale)
     opaque = alpha > marching.alpha_min
     passing = torch.ones_like(t)
     passing[ray, index] = torch.where(opaque, 1 - alpha, 1.0)
@@ -95,6 +100,16 @@ def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | No
     kept = opaque & (passing >= marching.transmittance_min)
     colored = torch.nonzero((passing * alpha > marching.weight_min)[kept])[:, 0]
     return Samples(t[ray, index][kept], ray[kept], rows[kept].int(), weights[kept], colored)
+
+
+def find_dense_cells(grid: BrickGrid, density: Tensor, least: float) -> Tensor:
+    """Occupied cells with a corner of more than that raw density (64 K, 1): (K,) int64, a bit for each of a brick's."""
+    dense = torch.zeros_like(grid.occupied)
+    for some in torch.arange(len(grid.bricks), device=density.device).split(2**13):
+        brick, cell = torch.nonzero(grid.occupied[some], as_tuple=True)
+        rows = grid.corner_rows(some[brick], cell)
+        dense[some[brick], cell] = density.detach()[rows, 0].amax(dim=1) > least
+    return pack_bits(dense)
 
 
 def corner_weights(fraction: Tensor) -> Tensor:

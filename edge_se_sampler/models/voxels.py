@@ -38,6 +38,10 @@ LAST_SUBDIVISION, LEVEL_RATIO = 0.4, 0.3
 """Part of the training after which the finest level begins, and by which each level ends before the next one does."""
 UNSETTLED = 0.4
 """Part of a level whose weights are not looked at when cells are pruned: they still move."""
+STEPS_PER_SAMPLED = 50
+"""Steps after which cells that have become transparent are found again."""
+TRANSPARENT_MARGIN = 0.7
+"""How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
 BYTES_PER_ROW = 4 * (3 * (FEATURE_DIM + 1) + 2) + 1
 """Density, features, their two running means, and what the grid and the kernels keep of a row."""
 
@@ -75,6 +79,7 @@ def compile_ops(device: str) -> None:
     for weight in (model.density, model.features):
         rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
         ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight), weight.grad, **rows)
+        ops.find_dense_cells(grid, weight.data, 0.0)
         ops.resample(grid.subdivide(cells.bool()).bricks, grid.numbers, weight.data)
     if time.monotonic() - began > 5:
         print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)
@@ -114,6 +119,15 @@ class VoxelModel(RayModel):
         self.features = nn.Parameter(torch.from_numpy(draws))
 
     @property
+    def marching(self) -> Marching:
+        """How rays are sampled in the grid's cells."""
+        step = self.config.step_size_voxels
+        density_scale = step * float(self.grid.cell_size / self.grid.finest_size)
+        config = self.config
+        thresholds = config.alpha_threshold, config.weight_threshold, config.transmittance_threshold
+        return Marching(step, density_scale, *thresholds)
+
+    @property
     def rays_per_chunk(self) -> int:
         return 2**14
 
@@ -146,11 +160,7 @@ class VoxelModel(RayModel):
 
     def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Samples, Tensor]:
         """Outputs of `forward`, samples, and the weights of those that have a color."""
-        ops, config, grid = choose_ops(self.density), self.config, self.grid
-        cell_size, finest = float(grid.cell_size), float(grid.finest_size)
-        step = config.step_size_voxels
-        thresholds = config.alpha_threshold, config.weight_threshold, config.transmittance_threshold
-        marching = Marching(step, step * cell_size / finest, *thresholds)
+        ops, config, grid, marching = choose_ops(self.density), self.config, self.grid, self.marching
         spans, jitter = self._spans(rays), self.uniform(len(rays), 1)[:, 0] if self.training else None
         samples = ops.march(grid, self.density, spans, jitter, marching)
         raw = ops.interpolate(self.density, samples.rows, samples.weights)
@@ -162,7 +172,7 @@ class VoxelModel(RayModel):
         background = self.get_background(rays)
         outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}
         if not self.training:
-            distance = samples.t[colored] * weight * cell_size
+            distance = samples.t[colored] * weight * float(grid.cell_size)
             depth = torch.zeros_like(accumulation).index_add_(0, samples.ray_indices[colored], distance[:, None])
             outputs["depth_fine"] = depth + (1 - accumulation) * config.far * rays.metadata["directions_norm"]
         return outputs | {"background": background}, samples, weight
@@ -184,10 +194,13 @@ class VoxelModel(RayModel):
         )
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """Prunes and subdivides cells, by the part of the training that is done."""
+        """Prunes and subdivides cells, by the part of the training that is done; now and then finds those that have
+        become transparent."""
         trainer = attributes.trainer
 
         def update_cells(step: int) -> None:
+            if step % STEPS_PER_SAMPLED == 0:
+                self.update_sampled()
             self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step))
 
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], update_cells)]
@@ -202,6 +215,12 @@ class VoxelModel(RayModel):
         # before that many weights are seen, nobody knows which cells are empty
         if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
             self._subdivide()
+
+    @torch.no_grad()
+    def update_sampled(self) -> None:
+        """Sample no cells in which the density is too low to be seen, nor can learn to be higher."""
+        least = self.marching.density_min - TRANSPARENT_MARGIN
+        self.grid.set_sampled(choose_ops(self.density).find_dense_cells(self.grid, self.density, least))
 
     def _level_span(self) -> tuple[float, float]:
         """Parts of the training at which the grid's level begins and ends."""
@@ -227,3 +246,4 @@ class VoxelModel(RayModel):
             parameter.grad = None
             parameter.data = choose_ops(self.density).resample(finer.bricks, self.grid.numbers, parameter.data)
         self.grid = finer
+        self.update_sampled()

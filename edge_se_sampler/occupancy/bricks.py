@@ -60,10 +60,11 @@ class BrickGrid(nn.Module):
     numbers: Tensor
     """(BX + 1, BY + 1, BZ + 1) int32: number of every brick that is stored; -1: not stored."""
     table: Tensor
-    """(BX, BY, BZ) int32: number of a brick that holds an occupied cell; else minus the distance, in bricks along the
-    farthest axis, to the next that does."""
-    bits: Tensor
-    """(K,) int64: bit i is set if the brick's cell i is occupied."""
+    """(BX, BY, BZ) int32: number of a brick in which a cell is sampled; else minus the distance, in bricks along the
+    farthest axis, to the next."""
+    sampled: Tensor
+    """(K,) int64: bit i is set if the brick's cell i is sampled: all occupied cells, or those of them that are not
+    transparent."""
 
     def __init__(self, aabb_min: Tensor, cell_size: float, cells: Tensor, max_level: int = 0) -> None:
         super().__init__()
@@ -84,7 +85,8 @@ class BrickGrid(nn.Module):
         self.register_buffer("bricks", torch.nonzero(_to_bricks(corners).flatten(3).any(dim=3)).contiguous())
         self.register_buffer("occupied", _to_bricks(cells).flatten(3)[tuple(self.bricks.T)])
         self.register_buffer("max_weight", torch.zeros(self.occupied.numel()))
-        self._index()
+        self._index_bricks()
+        self.set_sampled(pack_bits(self.occupied))
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor]) -> BrickGrid:
@@ -92,7 +94,8 @@ class BrickGrid(nn.Module):
         grid = cls(state["aabb_min"], 1.0, torch.zeros((1, 1, 1), dtype=torch.bool))
         for name in grid.state_dict():
             setattr(grid, name, state[name].clone(memory_format=torch.contiguous_format))
-        grid._index()
+        grid._index_bricks()
+        grid.set_sampled(grid.sampled)
         return grid
 
     def is_of_the_same_scene(self, other: BrickGrid) -> bool:
@@ -108,15 +111,19 @@ class BrickGrid(nn.Module):
         """Bricks along each axis of the box."""
         return [size // BRICK + 1 for size in self.size.tolist()]
 
-    def _index(self) -> None:
-        """Derive what marching looks up: `table`, `neighbors` and `bits`."""
+    def _index_bricks(self) -> None:
+        """Derive `numbers` and `neighbors`."""
         device = self.bricks.device
-        table = torch.full([size + 1 for size in self.shape], -1, dtype=torch.int32, device=device)
-        table[tuple(self.bricks.T)] = torch.arange(len(self.bricks), dtype=torch.int32, device=device)
+        numbers = torch.full([size + 1 for size in self.shape], -1, dtype=torch.int32, device=device)
+        numbers[tuple(self.bricks.T)] = torch.arange(len(self.bricks), dtype=torch.int32, device=device)
         upper = self.bricks[:, None] + OFFSETS.to(device)
-        self.register_buffer("neighbors", table[tuple(upper.unbind(dim=2))].contiguous(), persistent=False)
-        self.register_buffer("numbers", table, persistent=False)
-        some = self.occupied.any(dim=1)
+        self.register_buffer("neighbors", numbers[tuple(upper.unbind(dim=2))].contiguous(), persistent=False)
+        self.register_buffer("numbers", numbers, persistent=False)
+
+    def set_sampled(self, sampled: Tensor) -> None:
+        """Sample only some of the occupied cells, see `sampled`."""
+        self.register_buffer("sampled", sampled)
+        some = sampled != 0
         table = torch.zeros(self.shape, dtype=torch.bool, device=some.device)
         table[tuple(self.bricks[some].T)] = True
         distance = torch.zeros(self.shape, dtype=torch.int32, device=some.device)
@@ -125,8 +132,6 @@ class BrickGrid(nn.Module):
             table = dilate(table)
         distance.neg_()[tuple(self.bricks[some].T)] = torch.nonzero(some)[:, 0].int()
         self.register_buffer("table", distance, persistent=False)
-        weights = torch.ones((), dtype=torch.int64, device=some.device) << torch.arange(64, device=some.device)
-        self.register_buffer("bits", (self.occupied * weights).sum(dim=1), persistent=False)
 
     def update_max_weight(self, rows: Tensor, weights: Tensor) -> None:
         """Remember the weights (m,) of samples, by the rows (m,) int64 of their cells."""
@@ -175,6 +180,16 @@ def _to_bricks(cells: Tensor) -> Tensor:
     """(4 BX, 4 BY, 4 BZ) -> (BX, BY, BZ, 4, 4, 4)."""
     x, y, z = (size // BRICK for size in cells.shape)
     return cells.reshape(x, BRICK, y, BRICK, z, BRICK).permute(0, 2, 4, 1, 3, 5)
+
+
+def pack_bits(cells: Tensor) -> Tensor:
+    """(K, 64) bool -> (K,) int64."""
+    return (cells * (1 << torch.arange(64, device=cells.device))).sum(dim=1)
+
+
+def unpack_bits(numbers: Tensor) -> Tensor:
+    """(K,) int64 -> (K, 64) bool."""
+    return (numbers[:, None] >> torch.arange(64, device=numbers.device)) & 1 > 0
 
 
 def dilate(cells: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 rounding, for any number of threads."""
 
 from edge_se_sampler.models.voxel_kernels.compositing import composite
-from edge_se_sampler.models.voxel_kernels.marching import march
+from edge_se_sampler.models.voxel_kernels.marching import find_dense_cells, march
 from edge_se_sampler.models.voxel_kernels.rows import adam_rows, interpolate, resample
 from edge_se_sampler.models.voxel_kernels.shading import shade
 
-__all__ = ["adam_rows", "composite", "interpolate", "march", "resample", "shade"]
+__all__ = ["adam_rows", "composite", "find_dense_cells", "interpolate", "march", "resample", "shade"]

@@ -21,13 +21,18 @@ def composite(tau: Tensor, color: Tensor, samples: Samples, num_rays: int) -> tu
     return _Composite.apply(tau, color, samples.ray_indices, samples.colored, num_rays)
 
 
+def find_starts(ray_indices: Tensor, num_rays: int) -> np.ndarray:
+    """(n + 1,): the first sample of each ray, and the end, of samples on rays (m,), ascending."""
+    return np.concatenate(([0], np.bincount(ray_indices.numpy(), minlength=num_rays).cumsum()))
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, tau: Tensor, color: Tensor, ray_indices: Tensor, colored: Tensor, num_rays: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         arrays = [value.detach().numpy() for value in (tau, color, ray_indices, colored)]
-        starts = np.searchsorted(arrays[2], np.arange(num_rays + 1))
+        starts = find_starts(ray_indices, num_rays)
         color_starts = np.searchsorted(arrays[3], starts)
         rgb, accumulation, weights, passing = _composite(*arrays, starts, color_starts)
         ctx.arrays = *arrays, starts, color_starts, passing

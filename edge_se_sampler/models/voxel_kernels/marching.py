@@ -25,19 +25,19 @@ def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | No
     """As `voxel_ops.march`."""
     jitter = torch.full_like(spans.begin, 0.5) if jitter is None else jitter
     rays = [value.numpy() for value in (spans.origins, spans.directions, spans.begin, spans.end, jitter)]
-    cells = [value.numpy() for value in (grid.table, grid.neighbors, grid.bits)]
+    cells = [value.numpy() for value in (grid.table, grid.neighbors, grid.sampled)]
     numbers = tuple(map(f32, vars(marching).values()))
     capacity = CHUNK * SAMPLES_PER_RAY
     while True:
         counts, *found = _march(*rays, *cells, density.detach().numpy()[:, 0], numbers, capacity)
-        if counts[:, 0].max(initial=0) <= capacity:
+        if counts[:, 0].max(initial=0) < capacity:
             return Samples(*(torch.from_numpy(values) for values in _pack(counts, *found)))
-        capacity = int(counts[:, 0].max())
+        capacity = int(counts[:, 0].max()) + 1  # beside those found, one that is looked at
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _march(origins, directions, begin, end, jitter, table, neighbors, bits, density, marching, capacity):
-    """Samples of chunks of rays, at most `capacity` of each, and how many there would be, with how many colored."""
+def _march(origins, directions, begin, end, jitter, table, neighbors, sampled, density, marching, capacity):
+    """Samples of chunks of rays, less than `capacity` of each, and how many there would be, with how many colored."""
     num_rays = len(begin)
     chunks = (num_rays + CHUNK - 1) // CHUNK
     counts = np.zeros((chunks, 2), np.int64)
@@ -50,7 +50,7 @@ def _march(origins, directions, begin, end, jitter, table, neighbors, bits, dens
         m, c = 0, 0
         for i in range(chunk * CHUNK, min(chunk * CHUNK + CHUNK, num_rays)):
             m, c = _march_ray(
-                i, origins, directions, begin[i], end[i], jitter[i], table, neighbors, bits, density, marching,
+                i, origins, directions, begin[i], end[i], jitter[i], table, neighbors, sampled, density, marching,
                 chunk, m, c, t, ray, rows, weights, colored,
             )  # fmt: skip
         counts[chunk, 0], counts[chunk, 1] = m, c
@@ -59,7 +59,7 @@ def _march(origins, directions, begin, end, jitter, table, neighbors, bits, dens
 
 @njit(cache=True, error_model="numpy")
 def _march_ray(
-    i, origins, directions, begin, end, jitter, table, neighbors, bits, density, marching,
+    i, origins, directions, begin, end, jitter, table, neighbors, sampled, density, marching,
     chunk, m, c, t, ray, rows, weights, colored,
 ):  # fmt: skip
     step, scale, alpha_min, weight_min, transmittance_min = marching
@@ -87,17 +87,16 @@ def _march_ray(
             j = max(j, int((leave - begin) * steps_per_cell - jitter))
             continue
         cell = ((ix & 3) << 4) | ((iy & 3) << 2) | (iz & 3)
-        if not (bits[brick] >> cell) & 1:
+        if not (sampled[brick] >> cell) & 1:
             continue
         k = min(m, last)  # beyond the capacity, samples are only counted
         raw = _interpolate_density(
             x - f32(ix), y - f32(iy), z - f32(iz), brick, cell, neighbors, density, chunk, k, rows, weights
         )
         transparency = math.exp(-(math.exp(raw) * scale))
-        alpha = f32(1) - transparency
-        if alpha > alpha_min:
+        if f32(1) - transparency > alpha_min:
             t[chunk, k], ray[chunk, k] = s, i
-            if passing * alpha > weight_min:
+            if passing * (f32(1) - transparency) > weight_min:
                 colored[chunk, min(c, last_c)] = m
                 c += 1
             m += 1
@@ -144,11 +143,28 @@ def _pack(counts, t, ray, rows, weights, colored):
     packed_t, packed_ray, packed_colored = np.empty(m, np.float32), np.empty(m, np.int64), np.empty(c, np.int64)
     packed_rows, packed_weights = np.empty((m, 8), np.int32), np.empty((m, 8), np.float32)
     for chunk in prange(len(counts)):
-        first, first_colored = ends[chunk, 0], ends[chunk, 1]
-        for i in range(counts[chunk, 0]):
-            packed_t[first + i], packed_ray[first + i] = t[chunk, i], ray[chunk, i]
-            for k in range(8):
-                packed_rows[first + i, k], packed_weights[first + i, k] = rows[chunk, i, k], weights[chunk, i, k]
-        for i in range(counts[chunk, 1]):
-            packed_colored[first_colored + i] = colored[chunk, i] + first
+        first, end, count = ends[chunk, 0], ends[chunk + 1, 0], counts[chunk, 0]
+        packed_t[first:end], packed_ray[first:end] = t[chunk, :count], ray[chunk, :count]
+        packed_rows[first:end], packed_weights[first:end] = rows[chunk, :count], weights[chunk, :count]
+        packed_colored[ends[chunk, 1] : ends[chunk + 1, 1]] = colored[chunk, : counts[chunk, 1]] + first
     return packed_t, packed_ray, packed_rows, packed_weights, packed_colored
+
+
+def find_dense_cells(grid: BrickGrid, density: Tensor, least: float) -> Tensor:
+    """As `voxel_ops.find_dense_cells`."""
+    arrays = grid.occupied.numpy(), grid.neighbors.numpy(), density.detach().numpy()[:, 0]
+    return torch.from_numpy(_find_dense_cells(*arrays, f32(least)))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _find_dense_cells(occupied, neighbors, density, least):
+    dense = np.zeros(len(occupied), np.int64)
+    for brick in prange(len(occupied)):
+        for cell in range(64):
+            if not occupied[brick, cell]:
+                continue
+            for c in range(8):
+                if density[neighbors[brick, NEIGHBOR[cell, c]] * 64 + CORNER[cell, c]] > least:
+                    dense[brick] |= np.int64(1) << cell
+                    break
+    return dense

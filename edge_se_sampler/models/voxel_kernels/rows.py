@@ -30,26 +30,18 @@ class _Interpolate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        rows, weights = ctx.saved_tensors
-        parts = 1 << (numba.get_num_threads() - 1).bit_length()
-        touched, sums = _scatter(rows.numpy(), weights.numpy(), gradients[0].numpy(), _slots(ctx.shape[0]), parts)
-        indices, values = torch.from_numpy(touched)[None], torch.from_numpy(sums)
-        return (
-            torch.sparse_coo_tensor(indices, values, ctx.shape, check_invariants=False),
-            None,
-            None,
+        rows, weights = (value.numpy() for value in ctx.saved_tensors)
+        threads = numba.get_num_threads()
+        touched, firsts = _number_rows(rows, ctx.shape[0] // 64, threads)
+        indices, sums = _scatter(rows, weights, gradients[0].numpy(), touched, firsts, 1 << (threads - 1).bit_length())
+        sparse = torch.sparse_coo_tensor(
+            torch.from_numpy(indices)[None],
+            torch.from_numpy(sums),
+            ctx.shape,
+            check_invariants=False,
+            is_coalesced=True,
         )
-
-
-_WORKSPACE: dict[int, np.ndarray] = {}
-
-
-def _slots(num_rows: int) -> np.ndarray:
-    """(num_rows,) int32, all -1, to number rows in; kept, since filling it takes longer than using it."""
-    if num_rows not in _WORKSPACE:
-        _WORKSPACE.clear()
-        _WORKSPACE[num_rows] = np.full(num_rows, -1, np.int32)
-    return _WORKSPACE[num_rows]
+        return sparse, None, None
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
@@ -64,43 +56,51 @@ def _gather(values, rows, weights):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _scatter(rows, weights, gradient, slots, parts):
-    """Rows that samples touch, and the sums of their gradients. Each thread goes through all samples, in their order,
-    and adds up those of its own rows: the sums are the same for any number of threads. `parts` is a power of two."""
-    m = len(rows)
-    counts = np.zeros(parts + 1, np.int64)
-    touched = np.empty((parts, min(8 * m, len(slots))), np.int64)
-    numbers = np.empty((m, 8), np.int32)  # a row's number in its part; minus that, and one less, where it is new
-    for part in prange(parts):
-        count = 0
-        for i in range(m):
+def _number_rows(rows, num_bricks, threads):
+    """Which rows of each brick occur, as bits, and how many do in the bricks before."""
+    share = (len(rows) + threads - 1) // threads
+    seen = np.zeros((threads, num_bricks), np.int64)
+    for thread in prange(threads):
+        for i in range(thread * share, min((thread + 1) * share, len(rows))):
             for c in range(8):
                 row = rows[i, c]
-                if (row >> 12) & (parts - 1) == part:
-                    numbers[i, c] = slots[row]
-                    if slots[row] < 0:
-                        slots[row], numbers[i, c], touched[part, count] = count, -1 - count, row
-                        count += 1
-        for i in range(count):
-            slots[touched[part, i]] = -1
-        counts[part + 1] = count
-    firsts = np.cumsum(counts)
-    packed, sums = np.empty(firsts[-1], np.int64), np.empty((firsts[-1], gradient.shape[1]), np.float32)
+                seen[thread, row >> 6] |= np.int64(1) << (row & 63)
+    firsts = np.zeros(num_bricks + 1, np.int64)
+    for brick in range(num_bricks):
+        for thread in range(1, threads):
+            seen[0, brick] |= seen[thread, brick]
+        firsts[brick + 1] = firsts[brick] + _count_bits(seen[0, brick])
+    return seen[0], firsts
+
+
+@njit(cache=True, inline="always")
+def _count_bits(bits):
+    """A loop of additions that the compiler makes an instruction of."""
+    x = np.uint64(bits)
+    x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _scatter(rows, weights, gradient, touched, firsts, parts):
+    """Rows that samples touch, ascending, and the sums of their gradients. Each thread goes through all samples, in
+    their order, and adds up those of its own bricks: the sums are the same for any number of threads. `parts` is a
+    power of two."""
+    indices = np.empty(firsts[-1], np.int64)
+    sums = np.zeros((firsts[-1], gradient.shape[1]), np.float32)
     for part in prange(parts):
-        for i in range(m):
+        for i in range(len(rows)):
             for c in range(8):
-                row, number, weight = rows[i, c], numbers[i, c], weights[i, c]
-                if (row >> 12) & (parts - 1) == part:
-                    if number < 0:
-                        slot = firsts[part] - 1 - number
-                        packed[slot] = row
-                        for k in range(gradient.shape[1]):
-                            sums[slot, k] = weight * gradient[i, k]
-                    else:
-                        slot = firsts[part] + number
-                        for k in range(gradient.shape[1]):
-                            sums[slot, k] += weight * gradient[i, k]
-    return packed, sums
+                row, weight = rows[i, c], weights[i, c]
+                brick, bit = row >> 6, np.int64(1) << (row & 63)
+                if (brick >> 6) & (parts - 1) == part:
+                    slot = firsts[brick] + _count_bits(touched[brick] & (bit - 1))
+                    indices[slot] = row
+                    for k in range(gradient.shape[1]):
+                        sums[slot, k] += weight * gradient[i, k]
+    return indices, sums
 
 
 def adam_rows(
@@ -109,30 +109,14 @@ def adam_rows(
 ) -> None:  # fmt: skip
     """As `voxel_ops.adam_rows`."""
     arrays = [value.detach().numpy() for value in (values, mean, square)]
-    rows, sums = gradient._indices()[0].numpy(), gradient._values().numpy()
-    count = _sum_duplicates(rows, sums, _slots(len(arrays[0])))
-    rows, sums = rows[:count], sums[:count]
+    rows = gradient._indices()[0]
+    if (rows[1:] > rows[:-1]).all():  # of one backward pass, which autograd does not remember
+        gradient._coalesced_(True)
+    gradient = gradient.coalesce()
+    rows, sums = gradient.indices()[0].numpy(), gradient.values().numpy()
     if total_variation:
         _add_total_variation(arrays[0], rows, sums, f32(total_variation))
     _adam_rows(*arrays, rows, sums, *map(f32, (lr, *betas, eps, maximum)))
-
-
-@njit(cache=True, error_model="numpy")
-def _sum_duplicates(rows, sums, slots):
-    """Add up, in place, the values of rows that occur more than once, and return how many rows there are then."""
-    count = 0
-    for i in range(len(rows)):
-        slot = slots[rows[i]]
-        if slot < 0:
-            slots[rows[i]] = count
-            if count < i:
-                rows[count], sums[count] = rows[i], sums[i]
-            count += 1
-        else:
-            sums[slot] += sums[i]
-    for i in range(count):
-        slots[rows[i]] = -1
-    return count
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

@@ -11,6 +11,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from edge_se_sampler.models.voxel_kernels.compositing import find_starts
 from edge_se_sampler.models.voxel_ops import NetworkWeights
 
 CHUNK = 64
@@ -30,7 +31,7 @@ def shade(features: Tensor, directions: Tensor, ray_indices: Tensor, weights: Ne
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, directions: Tensor, ray_indices: Tensor, *weights: Tensor) -> Tensor:
-        starts = np.searchsorted(ray_indices.numpy(), np.arange(len(directions) + 1))
+        starts = find_starts(ray_indices, len(directions))
         w1, wv, bv, w2, b2 = (value.detach().numpy() for value in weights)
         x = features.detach().numpy()
         color, hidden, harmonics = _shade(x, directions.numpy(), starts, w1, wv, bv, w2, b2)
