@@ -44,7 +44,7 @@ def _lean_nerf() -> MethodSpecification:
 
 
 def _voxel_nerf() -> MethodSpecification:
-    sampler = EdgeSEPixelSamplerConfig(early="auto", late="uniform", images_per_step="all", patch_size=2)
+    sampler = EdgeSEPixelSamplerConfig(early="auto", late="se", error_source="cached", images_per_step="all")
     manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
     adam = OptimizerConfig(eps=1e-15, beta2=0.99, warmup_steps=20, fused=True)
     config = TrainerConfig(

@@ -54,7 +54,7 @@ def test_training_learns_the_ball_in_ever_smaller_cells() -> None:
     for step in range(300):
         losses.append(trainer.train_iteration(step))
         sizes.append(float(model.grid.cell_size))
-    assert [sizes.count(size) for size in sorted(set(sizes), reverse=True)] == [36, 84, 180]  # 0.12, 0.28, 0.6 of all
+    assert [sizes.count(size) for size in sorted(set(sizes), reverse=True)] == [81, 99, 120]  # 0.27, 0.33, 0.4 of all
     assert sizes[0] == pytest.approx(4 * sizes[-1])
     assert np.mean(losses[-20:]) < 0.1 * np.mean(losses[:20])
 
@@ -68,7 +68,7 @@ def test_cells_without_weight_are_left_out_when_cells_are_subdivided() -> None:
     rows = torch.nonzero(model.grid.occupied.reshape(-1))[:, 0]
     in_corner = torch.stack([model.grid.to_cells(torch.arange(model.grid.num_rows) == row)[seen].any() for row in rows])
     model.grid.update_max_weight(rows, in_corner.float())
-    model.update_cells(0.11, 0.13)
+    model.update_cells(0.26, 0.28)
     grid = model.grid
     assert int(grid.level) == 1
     expected = torch.zeros((16, 16, 16), dtype=torch.bool)
@@ -88,7 +88,7 @@ def test_subdividing_changes_little_of_what_is_rendered() -> None:
     before = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
     model.grid.update_max_weight(torch.arange(512), torch.ones(512))
     model.grid.max_weight.fill_(1)
-    model.update_cells(0.39, 0.41)
+    model.update_cells(0.59, 0.61)
     assert int(model.grid.level) == 1
     after = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
     assert float(before["accumulation_fine"].max()) > 0.9
@@ -99,19 +99,19 @@ def test_subdividing_changes_little_of_what_is_rendered() -> None:
 def test_cells_are_not_subdivided_before_enough_was_seen() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(511), torch.ones(511))  # of 512 cells
-    model.update_cells(0.11, 0.2)
+    model.update_cells(0.26, 0.3)
     assert int(model.grid.level) == 0
     model.grid.update_max_weight(torch.arange(1), torch.ones(1))
-    model.update_cells(0.2, 0.21)
+    model.update_cells(0.3, 0.31)
     assert int(model.grid.level) == 1
 
 
 def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(512), torch.ones(512))
-    model.update_cells(0.04, 0.047)
+    model.update_cells(0.1, 0.107)
     assert model.grid.max_weight.any()
-    model.update_cells(0.047, 0.049)  # 0.4 of 0.12
+    model.update_cells(0.107, 0.109)  # 0.4 of 0.27
     assert not model.grid.max_weight.any()
 
 
@@ -119,7 +119,7 @@ def test_a_grid_that_would_be_empty_is_an_error() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(512), torch.full((512,), 0.001))
     with pytest.raises(FloatingPointError, match=r"no cell has anything.*--optimizer\.lr"):
-        model.update_cells(0.11, 0.2)
+        model.update_cells(0.26, 0.3)
 
 
 def test_cells_are_subdivided_only_as_far_as_memory_allows() -> None:
@@ -137,7 +137,7 @@ def test_cells_are_subdivided_only_as_far_as_memory_allows() -> None:
     assert torch.equal(render_outputs(model, rays, ["rgb_fine"])["rgb_fine"], loaded.eval()(rays)["rgb_fine"])
 
 
-@pytest.mark.parametrize("stop", [3, 10, 30])
+@pytest.mark.parametrize("stop", [5, 20, 40])
 def test_a_resumed_training_is_the_same_bit_for_bit_at_every_level(stop: int, tmp_path: Path) -> None:
     whole = tiny_trainer(config_of(50), VIEWS)
     expected = steps_of(whole, 50)
@@ -229,7 +229,7 @@ def test_a_time_budget_is_kept_and_its_plan_repeats_it_bit_for_bit(scene: Path, 
         assert torch.equal(again.pipeline.model.state_dict()[name], value), name
         assert torch.equal(loaded.state_dict()[name], value), name
     previews = [line for line in first.run.metrics() if "val_psnr" in line]
-    assert 5 <= len(previews) <= 11
+    assert 2 <= len(previews) <= 11  # ten, where many steps fit into the time
     resumed = prepare_resume(first.run, saved)
     resumed.train()
     assert resumed.next_step == first.next_step

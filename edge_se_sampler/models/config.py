@@ -48,9 +48,9 @@ LEAN_PRESETS = {
     "tiny": SizePreset(64, 1, 6, 2, 6e-3, 256, 12_000),
 }
 VOXEL_PRESETS = {
-    "paper": SizePreset(64, 1, 0, 0, 1e-2, 8192, 7_000),
-    "small": SizePreset(64, 1, 0, 0, 1e-2, 8192, 4_000),
-    "tiny": SizePreset(64, 1, 0, 0, 1e-2, 8192, 2_000),
+    "paper": SizePreset(64, 1, 0, 0, 7e-3, 8192, 7_000),
+    "small": SizePreset(64, 1, 0, 0, 7e-3, 8192, 4_000),
+    "tiny": SizePreset(64, 1, 0, 0, 7e-3, 8192, 2_000),
 }
 
 

@@ -34,7 +34,7 @@ FEATURE_DIM, WIDTH = 16, 64
 """Features at a corner, and neurons of the hidden layer. The compiled kernels know no others."""
 INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
 """Denser than the maximum is as opaque, and slow to become transparent again."""
-LAST_SUBDIVISION, LEVEL_RATIO = 0.4, 0.3
+LAST_SUBDIVISION, LEVEL_RATIO = 0.6, 0.45
 """Part of the training after which the finest level begins, and by which each level ends before the next one does."""
 UNSETTLED = 0.4
 """Part of a level whose weights are not looked at when cells are pruned: they still move."""

@@ -60,10 +60,6 @@ class ImageBatch:
         """(H, W) bool on the CPU: the pixels at position k that may be drawn."""
         return self.mask[k].reshape(self.sizes[k]).bool().cpu()
 
-    def is_valid(self, drawn: Tensor) -> Tensor:
-        """(n,) bool on the CPU: whether pixels (n, 3), position in the batch, row, column, may be drawn by the mask."""
-        return self._pick(self.mask, drawn.to(self.mask[0].device)).reshape(len(drawn)).bool().cpu()
-
     def gather(self, drawn: Tensor) -> dict[str, Any]:
         """Every per-pixel key at drawn pixels, and `indices` (n, 3) int64: absolute image number, row, column.
 
@@ -71,9 +67,12 @@ class ImageBatch:
             drawn: (n, 3) int64: position in the batch, row, column.
         """
         pixels = {key: self._pick(value, drawn.to(value[0].device)) for key, value in self.per_pixel.items()}
-        numbers = self.numbers.to(drawn.device)[drawn[:, :1]]
-        pixels["indices"] = torch.cat((numbers, drawn[:, 1:]), dim=1).to(self.device)
+        pixels["indices"] = self.indices(drawn).to(self.device)
         return pixels
+
+    def indices(self, drawn: Tensor) -> Tensor:
+        """(n, 3) int64 absolute image number, row, column of pixels (n, 3): position in the batch, row, column."""
+        return torch.cat((self.numbers.to(drawn.device)[drawn[:, :1]], drawn[:, 1:]), dim=1)
 
     @staticmethod
     def _pick(value: Any, drawn: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -41,11 +42,14 @@ class PixelBatch:
     batch: ImageBatch
     pixels: Tensor
     """(n, 3) int64 on the CPU: position in the batch, row, column."""
-    values: dict[str, Any]
-    """What `ImageBatch.gather` returns at these pixels."""
     distribution: Distribution  # what drew them
     kept_ratio: Tensor | None = None
     """(n,) how much likelier than the average candidate each was kept by a selector; None: all were kept."""
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """What `ImageBatch.gather` returns at these pixels."""
+        return self.batch.gather(self.pixels)
 
     def density_ratio(self, rows: slice = slice(None)) -> Tensor:
         """(n,) p/u of these pixels, or of some rows of them."""
@@ -54,8 +58,10 @@ class PixelBatch:
 
     def take(self, rows: Tensor, kept_ratio: Tensor) -> PixelBatch:
         """Only the pixels of some rows."""
-        values = {key: value[rows.to(value.device)] for key, value in self.values.items()}
-        return PixelBatch(self.batch, self.pixels[rows.cpu()], values, self.distribution, kept_ratio.cpu())
+        taken = PixelBatch(self.batch, self.pixels[rows.cpu()], self.distribution, kept_ratio.cpu())
+        if "values" in vars(self):  # they are gathered already
+            vars(taken)["values"] = {key: value[rows.to(value.device)] for key, value in self.values.items()}
+        return taken
 
 
 class SamplerPart:
@@ -96,11 +102,6 @@ class Distribution(SamplerPart, ABC):
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
         """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`."""
-        pixels = self.draw_pixels(batch, count, step)
-        return PixelBatch(batch, pixels, batch.gather(pixels), self)
-
-    def draw_pixels(self, batch: ImageBatch, count: int, step: TrainingStep) -> Tensor:
-        """What `draw` draws: (count, 3) int64 position in the batch, row, column."""
         rng = stream(step.seed, step.number, Stream.PIXELS)
         source, table_index, drawable = self.drawable(batch)
         if self.settings.images_per_step == "one":
@@ -108,7 +109,7 @@ class Distribution(SamplerPart, ABC):
         # strided: a table's draws come ordered by image
         pixels = source.draw(table_index[drawable], count * step.world, rng)[step.rank :: step.world]
         pixels[:, 0] = drawable[pixels[:, 0]]
-        return pixels
+        return PixelBatch(batch, pixels, self)
 
     def density_ratio(self, batch: ImageBatch, pixels: Tensor) -> Tensor:
         """p/u (n,) of pixels (n, 3): position in the batch, row, column."""

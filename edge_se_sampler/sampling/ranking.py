@@ -57,7 +57,7 @@ def sample_by_rank(squared_error: Tensor, keep: int, rng: np.random.Generator) -
         raise FloatingPointError(f"the squared errors of {bad} of {len(errors)} candidates are not finite")
     weights = error_ranks(errors, rng)
     arrival = rng.standard_exponential(len(errors)) / weights
-    order = np.argsort(arrival)
+    order = np.argpartition(arrival, keep) if keep < len(errors) else np.arange(keep)
     first = np.sort(order[:keep])
     tau = arrival[order[keep]] if keep < len(errors) else np.inf
     inclusion = -np.expm1(-weights[first] * tau)

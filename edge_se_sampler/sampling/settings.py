@@ -35,9 +35,6 @@ class SamplingSettings:
     images_per_step: Literal["one", "all"] = "one"
     """Draw a step's pixels from one image (the paper) or from all loaded images (nerfstudio); an image is chosen
     first, a pixel in it second."""
-    patch_size: int = 1
-    """Draw squares of so many pixels a side where pixels are drawn uniformly: their rays meet the same cells, which are
-    then in the processor's cache."""
     precrop_fraction: float = 0.5
     """Side of the precrop box as a share of the image's side."""
     edge_filter: Literal["sobel", "laplacian", "canny"] = "sobel"
@@ -72,13 +69,10 @@ class SamplingSettings:
         """Field, whether its value has a meaning, and what is wrong if not."""
         in_steps, steps, weight = self.schedule == "steps", self.early_steps, self.importance_weight
         all_uniform = self.early != "edge" and self.late == "uniform"
-        patches_weighted = self.patch_size > 1 and (self.late == "se" or weight > 0)
         epsilon_range = "must be between 1e-6 and 1e6 (less would never train flat regions)"
         not_in_steps = f"has no effect under schedule {self.schedule!r}; add --...schedule steps"
         needs_edges = "'adaptive' compares edges with uniform pixels: it needs early edge"
         return [
-            ("patch_size", self.patch_size >= 1, "must be at least 1"),
-            ("patch_size", not patches_weighted, "must be 1 with squared errors or loss weights: they are a pixel's"),
             ("precrop_fraction", 0 < self.precrop_fraction <= 1, "must be above 0 and at most 1"),
             ("early_fraction", 0 <= self.early_fraction <= 1, "must be between 0 and 1"),
             ("early_steps", not in_steps or steps >= 1, "schedule 'steps' needs a number of steps, at least 1"),

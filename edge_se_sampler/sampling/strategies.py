@@ -44,27 +44,6 @@ class Uniform(Distribution):
             return super().tables(batch)
         return UniformPixels(batch.sizes, self.box_fraction), torch.arange(len(batch.sizes))
 
-    def draw_pixels(self, batch: ImageBatch, count: int, step: TrainingStep) -> Tensor:
-        """As `Distribution.draw_pixels`; with a patch size, whole squares."""
-        side = self.settings.patch_size
-        pixels = super().draw_pixels(batch, -(-count // side**2), step)
-        return pixels if side == 1 else spread_to_squares(pixels, batch, side)[:count]
-
-
-def spread_to_squares(pixels: Tensor, batch: ImageBatch, side: int) -> Tensor:
-    """Each of the pixels (n, 3) int64 position, row, column -> all of the square of its image's raster of such squares
-    that it is in, (n * side^2, 3); in place of those that are masked, or outside of the image, itself."""
-    offsets = torch.cartesian_prod(torch.arange(side), torch.arange(side))
-    squares = pixels[:, None].repeat(1, side * side, 1)
-    squares[:, :, 1:] = squares[:, :, 1:] // side * side + offsets
-    sizes = torch.tensor(batch.sizes)[pixels[:, 0]]
-    valid = (squares[:, :, 1:] < sizes[:, None]).all(dim=2)
-    squares = torch.where(valid[:, :, None], squares, pixels[:, None])
-    if batch.mask is not None:
-        valid = batch.is_valid(squares.reshape(-1, 3)).reshape(valid.shape)
-        squares = torch.where(valid[:, :, None], squares, pixels[:, None])
-    return squares.reshape(-1, 3)
-
 
 class Precrop(Uniform):
     """All pixels of the centered box alike (equation 3)."""
@@ -101,7 +80,7 @@ class RankedError(Selector):
         """`count` of the candidates, without replacement, in proportion to the rank of their squared error."""
         if self.error_map is not None:
             self.error_map.add(candidates.batch.sizes_by_number)
-            pixels = candidates.values["indices"].cpu().numpy()
+            pixels = candidates.batch.indices(candidates.pixels).numpy()
             errors = torch.from_numpy(self.error_map.lookup(pixels, step.number, count))
         else:
             assert step.squared_error is not None

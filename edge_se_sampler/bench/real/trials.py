@@ -15,7 +15,7 @@ from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.runner import Run, run_in_subprocess
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.downscale import downscale
-from edge_se_sampler.engine.config import MODEL, override
+from edge_se_sampler.engine.config import MODEL, SAMPLER, override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
@@ -23,6 +23,7 @@ from edge_se_sampler.methods import method_configs
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "voxel-nerf": {},
+    "uniform pixels": {f"{SAMPLER}.late": "uniform", f"{SAMPLER}.error_source": "fine"},
     "no hull": {f"{MODEL}.cull_by_alpha": False},
     "no total variation": {f"{MODEL}.total_variation": 0.0},
     "no alpha loss": {f"{MODEL}.alpha_loss": 0.0},
