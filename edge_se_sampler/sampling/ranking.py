@@ -22,7 +22,7 @@ from torch import Tensor
 def error_ranks(squared_error: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Ranks 1 .. m by ascending squared error, ties broken at random; (m,) -> (m,) int64."""
     shuffled = rng.permutation(len(squared_error))
-    ascending = shuffled[np.argsort(squared_error[shuffled])]  # in any order where they are tied: they are shuffled
+    ascending = shuffled[np.argsort(squared_error[shuffled], kind="stable")]
     ranks = np.empty(len(squared_error), dtype=np.int64)
     ranks[ascending] = np.arange(1, len(squared_error) + 1)
     return ranks
