@@ -14,6 +14,7 @@ from tiny import ball_views, resume_trainer, tiny_rays, tiny_trainer
 
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
+from edge_se_sampler.engine.optimizers import create_adam
 from edge_se_sampler.engine.pipeline import load_weights, saved_grid
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.run_folder import RunFolder
@@ -23,8 +24,9 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import voxels
 from edge_se_sampler.models.config import VoxelModelConfig
+from edge_se_sampler.models.ray_model import ParameterGroup
 from edge_se_sampler.models.voxels import VoxelModel
-from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
 VIEWS = ball_views()
 
@@ -115,6 +117,40 @@ def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
     assert not model.grid.max_weight.any()
 
 
+def test_cells_that_have_become_transparent_are_not_sampled() -> None:
+    model = full_model()
+    with torch.no_grad():
+        model.density.fill_(-20.0)
+        model.density[0] = 0.0
+    assert (unpack_bits(model.grid.sampled) == model.grid.occupied).all()
+    model.update_sampled()
+    sampled = model.grid.to_cells(unpack_bits(model.grid.sampled).reshape(-1))
+    x, y, z = model.grid.bricks[0].tolist()
+    assert torch.nonzero(sampled).tolist() == [[x, y, z]]  # cells on the other sides of that corner are outside
+    assert torch.nonzero(model.grid.table >= 0).tolist() == [[x, y, z]]
+
+
+def test_total_variation_counts_in_every_fourth_step() -> None:
+    """Four times as much: without another gradient, a row moves towards its neighbors then."""
+    values = torch.nn.Parameter(torch.zeros(64, 16))
+    with torch.no_grad():
+        values[0] = 1.0
+    group = ParameterGroup([values], lr_scale=10.0, total_variation=0.1)
+    config = config_of(None, size="tiny")
+    adam = create_adam([group], config.preset, config.optimizer)
+    gradient = torch.sparse_coo_tensor([[0]], torch.zeros(1, 16), (64, 16), check_invariants=True)
+    seen = []
+    for _ in range(4):
+        values.grad = gradient.clone()
+        adam.step()
+        seen.append(values[0, 0].item())
+    assert seen[:3] == [1.0] * 3
+    step = 10 * config.preset.learning_rate  # of Adam, whose means are a tenth and a hundredth of the first gradient
+    assert seen[3] == pytest.approx(1 - step, rel=1e-5)
+    weight = 4 * 0.1 / (3 * config.preset.rays)
+    assert float(adam.state[values]["exp_avg"][0, 0]) == pytest.approx(0.1 * 3 * weight, rel=1e-5)  # three neighbors
+
+
 def test_a_grid_that_would_be_empty_is_an_error() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(512), torch.full((512,), 0.001))
@@ -133,12 +169,17 @@ def test_cells_are_subdivided_only_as_far_as_memory_allows() -> None:
     state = model.state_dict()
     loaded = VoxelModel(model.config, np.random.default_rng(1), saved_grid(state))  # pyright: ignore
     load_weights(loaded, state)
-    rays = tiny_rays(50, dtype=torch.float32)
-    assert torch.equal(render_outputs(model, rays, ["rgb_fine"])["rgb_fine"], loaded.eval()(rays)["rgb_fine"])
+    before, after = (
+        render_outputs(of, tiny_rays(50, dtype=torch.float32), ["rgb_fine"])["rgb_fine"] for of in (model, loaded)
+    )
+    assert torch.equal(before, after)
 
 
 @pytest.mark.parametrize("stop", [5, 20, 40])
-def test_a_resumed_training_is_the_same_bit_for_bit_at_every_level(stop: int, tmp_path: Path) -> None:
+def test_a_resumed_training_is_the_same_bit_for_bit_at_every_level(
+    stop: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(voxels, "STEPS_PER_SAMPLED", 7)
     whole = tiny_trainer(config_of(50), VIEWS)
     expected = steps_of(whole, 50)
     assert int(whole.pipeline.model.grid.level) == 2

@@ -20,9 +20,11 @@ from torch import Tensor
 
 
 def error_ranks(squared_error: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Ranks 1 .. m by ascending squared error, ties broken at random; (m,) -> (m,) int64."""
+    """Ranks 1 .. m by ascending squared error, a float32 >= 0, ties broken at random; (m,) -> (m,) int64."""
     shuffled = rng.permutation(len(squared_error))
-    ascending = shuffled[np.argsort(squared_error[shuffled], kind="stable")]
+    # floats >= 0 are ordered as their bits are; with the position below them no two are equal, and any sort will do
+    bits = squared_error[shuffled].astype(np.float32).view(np.int32).astype(np.int64)
+    ascending = shuffled[np.sort(bits << 32 | np.arange(len(bits))) & 0xFFFFFFFF]
     ranks = np.empty(len(squared_error), dtype=np.int64)
     ranks[ascending] = np.arange(1, len(squared_error) + 1)
     return ranks
