@@ -138,7 +138,7 @@ def test_total_variation_counts_in_every_fourth_step() -> None:
     group = ParameterGroup([values], lr_scale=10.0, total_variation=0.1)
     config = config_of(None, size="tiny")
     adam = create_adam([group], config.preset, config.optimizer)
-    gradient = torch.sparse_coo_tensor([[0]], torch.zeros(1, 16), (64, 16), check_invariants=True)
+    gradient = torch.sparse_coo_tensor(torch.tensor([[0]]), torch.zeros(1, 16), (64, 16), check_invariants=True)
     seen = []
     for _ in range(4):
         values.grad = gradient.clone()
