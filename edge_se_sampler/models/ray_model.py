@@ -24,9 +24,9 @@ class ParameterGroup:
     lr_scale: float = 1.0
     """Their learning rate, as a multiple of the run's."""
     maximum: float = float("inf")
-    """What rows of theirs that have a sparse gradient may become at most."""
+    """Upper bound that weights with sparse gradients (an embedding's) are clamped to."""
     total_variation: float = 0.0
-    """How much, beside a ray's squared error, the squared differences of such rows to their neighbors count."""
+    """Weight, relative to a ray's squared error, of the total variation of weights with sparse gradients."""
 
 
 class RayModel(nn.Module, ABC):

@@ -94,9 +94,10 @@ def _march_ray(
             x - f32(ix), y - f32(iy), z - f32(iz), brick, cell, neighbors, density, chunk, k, rows, weights
         )
         transparency = math.exp(-(math.exp(raw) * scale))
-        if f32(1) - transparency > alpha_min:
+        alpha = f32(1) - transparency
+        if alpha > alpha_min:
             t[chunk, k], ray[chunk, k] = s, i
-            if passing * (f32(1) - transparency) > weight_min:
+            if passing * alpha > weight_min:
                 colored[chunk, min(c, last_c)] = m
                 c += 1
             m += 1

@@ -75,7 +75,7 @@ def _number_rows(rows, num_bricks, threads):
 
 @njit(cache=True, inline="always")
 def _count_bits(bits):
-    """A loop of additions that the compiler makes an instruction of."""
+    """How many bits of 64 are set: sums of ever more of them, which compilers replace by one instruction."""
     x = np.uint64(bits)
     x -= (x >> np.uint64(1)) & np.uint64(0x5555555555555555)
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
