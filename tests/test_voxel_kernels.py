@@ -17,10 +17,9 @@ from tiny import ball_views, tiny_trainer
 from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import voxel_kernels, voxel_ops, voxels
-from edge_se_sampler.models.config import VoxelModelConfig
-from edge_se_sampler.models.voxel_kernels import marching as marching_kernels
-from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Samples
-from edge_se_sampler.models.voxels import VoxelModel
+from edge_se_sampler.models.voxel_kernels import rendering
+from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
+from edge_se_sampler.models.voxels import ColorNetwork
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
 MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01)
@@ -53,11 +52,15 @@ def random_tensor(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(seed).normal(size=shape)).float()
 
 
-def march(ops: ModuleType, marching: Marching = MARCHING) -> tuple[Samples, torch.Tensor]:
+def jitter() -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(4).random(300)).float()
+
+
+def render(ops: ModuleType, marching: Marching = MARCHING) -> Rendered:
     grid = shell()
-    density = random_tensor(grid.num_rows, 1) * 2 - 1
-    jitter = torch.from_numpy(np.random.default_rng(4).random(300)).float()
-    return ops.march(grid, density, crossing_spans(), jitter, marching), density
+    weights = ColorNetwork(np.random.default_rng(0)).weights()
+    density, features = random_tensor(grid.num_rows, 1) * 2 - 1, random_tensor(grid.num_rows, 16, seed=5)
+    return ops.render(grid, density, features, weights, crossing_spans(), jitter(), marching)
 
 
 def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-4) -> None:
@@ -67,25 +70,30 @@ def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float =
 
 
 @pytest.mark.parametrize("step", [0.3, 1.0, 2.5])
-def test_marching_finds_the_same_samples(step: float) -> None:
+def test_the_same_samples_have_colors(step: float) -> None:
     marching = replace(MARCHING, step=step)
-    (found, _), (expected, _) = march(voxel_kernels, marching), march(voxel_ops, marching)
-    assert len(expected.t) > 500
-    assert len(expected.colored) < len(expected.t)
+    found, expected = render(voxel_kernels, marching), render(voxel_ops, marching)
+    assert len(expected.cells) > 200
+    assert torch.equal(found.cells, expected.cells)
     for name, value in vars(expected).items():
-        assert torch.equal(getattr(found, name), value), name
+        assert_close(getattr(found, name), value)
 
 
 def test_rays_end_where_no_light_passes() -> None:
-    lengths = [len(march(voxel_kernels, replace(MARCHING, transmittance_min=least))[0].t) for least in (0.0, 0.01, 0.5)]
-    assert lengths[0] > 1.1 * lengths[1] > 1.2 * lengths[2]
+    whole, early = (
+        render(voxel_kernels, replace(MARCHING, transmittance_min=least)).accumulation for least in (0.0, 0.5)
+    )
+    ended = early < whole
+    assert 10 < int(ended.sum()) < 290
+    assert float(early[ended].min()) >= 0.5
 
 
 @pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
 def test_cells_that_are_too_thin_to_be_seen_need_not_be_sampled(ops: ModuleType) -> None:
-    grid, rays = shell(), (crossing_spans(), torch.full((300,), 0.3), MARCHING)
-    density = 2 * random_tensor(grid.num_rows, 1) - 7
-    samples = ops.march(grid, density, *rays)
+    grid, rays = shell(), (crossing_spans(), jitter(), MARCHING)
+    density, features = 2 * random_tensor(grid.num_rows, 1) - 7, random_tensor(grid.num_rows, 16, seed=5)
+    weights = ColorNetwork(np.random.default_rng(0)).weights()
+    rendered = ops.render(grid, density, features, weights, *rays)
     dense = ops.find_dense_cells(grid, density, MARCHING.density_min)
     corners = grid.corner_rows(*torch.nonzero(grid.occupied, as_tuple=True))
     expected = torch.zeros_like(grid.occupied)
@@ -93,39 +101,53 @@ def test_cells_that_are_too_thin_to_be_seen_need_not_be_sampled(ops: ModuleType)
     assert torch.equal(unpack_bits(dense), expected)
     assert 0.2 < float(expected.sum() / grid.occupied.sum()) < 0.9
     grid.set_sampled(dense)
-    again = ops.march(grid, density, *rays)
-    assert len(again.t) > 20
-    assert torch.equal(again.t, samples.t)
-
-
-def test_more_samples_than_were_made_room_for_are_found_in_a_second_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, _ = march(voxel_kernels)
-    monkeypatch.setattr(marching_kernels, "SAMPLES_PER_RAY", 1)
-    again, _ = march(voxel_kernels)
-    for name, value in vars(whole).items():
+    again = ops.render(grid, density, features, weights, *rays)
+    assert int((again.accumulation > 0).sum()) > 20
+    for name, value in vars(rendered).items():
         assert torch.equal(getattr(again, name), value), name
 
 
+def test_more_samples_than_were_made_room_for_are_found_in_a_second_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = gradients_of(voxel_kernels)
+    monkeypatch.setattr(rendering, "SAMPLES_PER_RAY", 1)
+    rendering._spare.clear()
+    for name, value in gradients_of(voxel_kernels).items():
+        assert torch.equal(whole[name], value), name
+
+
+def test_two_renderings_before_a_backward_pass_do_not_share_memory() -> None:
+    grid, network = shell(), ColorNetwork(np.random.default_rng(0))
+    density = torch.nn.Parameter(random_tensor(grid.num_rows, 1) * 2 - 1)
+    features = torch.nn.Parameter(random_tensor(grid.num_rows, 16, seed=5))
+
+    def rendered(of: float) -> torch.Tensor:
+        shift = torch.full((300,), of)
+        rays = crossing_spans(), shift, MARCHING
+        return voxel_kernels.render(grid, density, features, network.weights(), *rays).rgb.square().sum()
+
+    first, second = rendered(0.1), rendered(0.8)
+    (first + second).backward()
+    assert features.grad is not None
+    both, features.grad = features.grad.to_dense(), None
+    rendered(0.1).backward()
+    rendered(0.8).backward()
+    assert_close(features.grad.to_dense(), both, 1e-5)
+
+
 def gradients_of(ops: ModuleType) -> dict[str, torch.Tensor]:
-    """Colors, and gradients of everything that is trained, sparse ones made dense."""
-    samples, density = march(ops)
-    model = VoxelModel(VoxelModelConfig(size="tiny"), np.random.default_rng(0), shell())
-    weights = model.fine.weights()
-    features = torch.nn.Parameter(random_tensor(len(density), 16, seed=5))
-    raw = torch.nn.Parameter(density)
-    tau = torch.exp(ops.interpolate(raw, samples.rows, samples.weights)[:, 0])
-    colored = samples.colored
-    x = ops.interpolate(features, samples.rows[colored], samples.weights[colored])
-    color = ops.shade(x, crossing_spans().directions, samples.ray_indices[colored], weights)
-    rgb, accumulation, weight = ops.composite(tau, color, samples, 300)
+    """What is rendered, and gradients of everything that is trained, sparse ones made dense."""
+    grid, network = shell(), ColorNetwork(np.random.default_rng(0))
+    raw = torch.nn.Parameter(random_tensor(grid.num_rows, 1) * 2 - 1)
+    features = torch.nn.Parameter(random_tensor(grid.num_rows, 16, seed=5))
+    rendered = ops.render(grid, raw, features, network.weights(), crossing_spans(), jitter(), MARCHING)
     wanted = random_tensor(300, 4, seed=6)
-    (rgb * wanted[:, :3]).sum().add((accumulation * wanted[:, 3:]).sum()).backward()
-    named = {"density": raw, "features": features, **dict(model.fine.named_parameters())}
+    (rendered.rgb * wanted[:, :3]).sum().add((rendered.accumulation * wanted[:, 3:]).sum()).backward()
+    named = {"density": raw, "features": features, **dict(network.named_parameters())}
     gradients = {name: value.grad for name, value in named.items()}
     assert gradients["density"].is_sparse  # pyright: ignore
     dense = {name: grad.to_dense() for name, grad in gradients.items() if grad is not None}
     assert dense.keys() == named.keys()
-    return dense | {"rgb": rgb.detach(), "accumulation": accumulation.detach(), "weight": weight}
+    return dense | {name: value.detach() for name, value in vars(rendered).items()}
 
 
 def test_colors_and_gradients_are_the_reference_s() -> None:
@@ -193,10 +215,10 @@ def test_finer_corners_have_the_values_around_them(ops: ModuleType) -> None:
 COMPILED = """
 from numba.core.registry import CPUDispatcher
 from edge_se_sampler.models import voxels
-from edge_se_sampler.models.voxel_kernels import compositing, marching, rows, shading
+from edge_se_sampler.models.voxel_kernels import marching, rendering, rows, shading
 
 def signatures():
-    functions = [f for m in (compositing, marching, rows, shading) for f in vars(m).values()]
+    functions = [f for m in (marching, rendering, rows, shading) for f in vars(m).values()]
     return {f.py_func.__name__: len(f.signatures) for f in functions if isinstance(f, CPUDispatcher)}
 
 voxels.compile_ops("cpu")

@@ -70,13 +70,45 @@ class Samples:
     """(c,) int64: which samples have a color."""
 
 
-def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | None, marching: Marching) -> Samples:
-    """The samples of rays in the cells that are sampled, as far as light passes.
+@dataclass(frozen=True)
+class Rendered:
+    """n rays in front of black."""
+
+    rgb: Tensor
+    """(n, 3)."""
+    accumulation: Tensor
+    """(n, 1) opacity."""
+    distance: Tensor
+    """(n, 1): weights times distances of samples, in sides of a cell; without a gradient."""
+    cells: Tensor
+    """(c,) int64: rows of the cells of the samples that have a color; kernels leave it empty where nothing is trained."""
+    weights: Tensor
+    """(c,): weights of those in their ray's color; without a gradient."""
+
+
+def render(
+    grid: BrickGrid, density: Tensor, features: Tensor, network: NetworkWeights,
+    spans: RaySpans, jitter: Tensor | None, marching: Marching,
+) -> Rendered:  # fmt: skip
+    """Colors of n rays (NeRF, equation 3).
 
     Args:
-        density: (64 K, 1) raw density at the corners.
+        density: (64 K, 1) raw density at the corners; its gradient is sparse.
+        features: (64 K, F) at the corners; their gradient is sparse, and has the same rows.
         jitter: (n,) in [0, 1): share of a step before the first sample; None: half a step.
     """
+    num_rays, samples = len(spans.begin), march(grid, density, spans, jitter, marching)
+    colored = samples.colored
+    tau = torch.exp(interpolate(density, samples.rows, samples.weights)[:, 0]) * marching.density_scale
+    values = interpolate(features, samples.rows, samples.weights)[colored]
+    color = shade(values, spans.directions, samples.ray_indices[colored], network)
+    rgb, accumulation, weights = composite(tau, color, samples, num_rays)
+    distance = torch.zeros_like(accumulation[:, 0]).index_add(0, samples.ray_indices[colored], samples.t[colored] * weights)
+    return Rendered(rgb, accumulation, distance[:, None], samples.rows[colored, 0].long(), weights)
+
+
+def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | None, marching: Marching) -> Samples:
+    """The samples of rays in the cells that are sampled, as far as light passes; see `render`."""
     begin, end = spans.begin[:, None], spans.end[:, None]
     count = int(((end - begin).clamp(min=0).max() / marching.step).ceil()) + 1 if len(begin) else 0
     offsets = torch.arange(count, device=begin.device, dtype=begin.dtype)
@@ -92,8 +124,9 @@ def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | No
     ray, index, brick, in_brick = ray[sampled], index[sampled], brick[sampled], in_brick[sampled]
     rows = grid.corner_rows(brick, in_brick)
     weights = corner_weights(position[sampled] - cell[sampled])
-    alpha = 1 - torch.exp(-torch.exp(interpolate(density, rows, weights)[:, 0]) * marching.density_scale)
-    opaque = alpha > marching.alpha_min
+    raw = interpolate(density.detach(), rows, weights)[:, 0]
+    alpha = 1 - torch.exp(-torch.exp(raw) * marching.density_scale)
+    opaque = raw > marching.density_min
     passing = torch.ones_like(t)
     passing[ray, index] = torch.where(opaque, 1 - alpha, 1.0)
     passing = torch.cat((torch.ones_like(begin), passing.cumprod(dim=1)), dim=1)[ray, index]

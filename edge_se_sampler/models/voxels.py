@@ -26,7 +26,7 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models import voxel_ops
 from edge_se_sampler.models.config import VoxelModelConfig
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
-from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Samples
+from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, dilate
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
@@ -145,9 +145,9 @@ class VoxelModel(RayModel):
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """As `RayModel`; remembers the largest weight in each cell."""
-        outputs, samples, weight = self._render(rays)
+        outputs, rendered = self._render(rays)
         if self.grid.level < self.grid.max_level:
-            self.grid.update_max_weight(samples.rows[samples.colored, 0].long(), weight)
+            self.grid.update_max_weight(rendered.cells, rendered.weights)
         return self.loss(outputs, batch)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -158,24 +158,17 @@ class VoxelModel(RayModel):
             loss = loss + self.config.alpha_loss / 3 * batch.get("weight", 1.0) * difference.square()
         return loss, error
 
-    def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Samples, Tensor]:
-        """Outputs of `forward`, samples, and the weights of those that have a color."""
-        ops, config, grid, marching = choose_ops(self.density), self.config, self.grid, self.marching
+    def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
+        """Outputs of `forward`, and what they were made of."""
         spans, jitter = self._spans(rays), self.uniform(len(rays), 1)[:, 0] if self.training else None
-        samples = ops.march(grid, self.density, spans, jitter, marching)
-        raw = ops.interpolate(self.density, samples.rows, samples.weights)
-        tau = torch.exp(raw[:, 0]) * marching.density_scale
-        colored = samples.colored
-        features = ops.interpolate(self.features, samples.rows[colored], samples.weights[colored])
-        color = ops.shade(features, rays.directions, samples.ray_indices[colored], self.fine.weights())
-        rgb, accumulation, weight = ops.composite(tau, color, samples, len(rays))
-        background = self.get_background(rays)
-        outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}
+        weights = self.density, self.features, self.fine.weights()
+        rendered = choose_ops(self.density).render(self.grid, *weights, spans, jitter, self.marching)
+        background, passing = self.get_background(rays), 1 - rendered.accumulation
+        outputs = {"rgb_fine": rendered.rgb + passing * background, "accumulation_fine": rendered.accumulation}
         if not self.training:
-            distance = samples.t[colored] * weight * float(grid.cell_size)
-            depth = torch.zeros_like(accumulation).index_add_(0, samples.ray_indices[colored], distance[:, None])
-            outputs["depth_fine"] = depth + (1 - accumulation) * config.far * rays.metadata["directions_norm"]
-        return outputs | {"background": background}, samples, weight
+            depth = rendered.distance * float(self.grid.cell_size)
+            outputs["depth_fine"] = depth + passing * self.config.far * rays.metadata["directions_norm"]
+        return outputs | {"background": background}, rendered
 
     def _spans(self, rays: RayBundle) -> RaySpans:
         """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it."""

@@ -1,69 +1,57 @@
-"""Values at corners compiled: their interpolation, its gradient, steps of Adam, finer corners. Only rows that a step
-touches are written to."""
+"""Values at corners compiled: sums of their gradients, steps of Adam, finer corners. Only rows that a step touches are
+written to."""
 
 # pyright: reportCallIssue=false
 from __future__ import annotations
 
 import math
-from typing import Any
-
 import numba
 import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
+from edge_se_sampler.models.voxel_kernels.buffers import FEATURES, Buffers
+from edge_se_sampler.models.voxel_kernels.simd import load, minimum, prefetch, splat, sqrt, store
+
+AHEAD = 8
+"""Rows that are fetched into the cache before they are needed."""
 f32 = np.float32
 
 
-def interpolate(values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """As `voxel_ops.interpolate`."""
-    return _Interpolate.apply(values, rows, weights)
+@njit(cache=True, error_model="numpy")
+def interpolate(values, rows, weights, i, out, j):
+    """Features of 16 numbers, out[j:], at the corners rows[i:] with weights[i:]."""
+    result = splat(weights[i]) * load(values, FEATURES * np.int64(rows[i]))
+    for corner in range(i + 1, i + 8):
+        result += splat(weights[corner]) * load(values, FEATURES * np.int64(rows[corner]))
+    store(out, j, result)
 
 
-class _Interpolate(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-        ctx.save_for_backward(rows, weights)
-        ctx.shape = values.shape
-        return torch.from_numpy(_gather(values.detach().numpy(), rows.numpy(), weights.numpy()))
+def sum_row_gradients(buffers: Buffers, num_rows: int) -> tuple[Tensor, Tensor]:
+    """Sparse gradients of densities (num_rows, 1) and features, of what the backward pass left in the buffers: all rows
+    that samples touch, ascending."""
+    threads = numba.get_num_threads()
+    touched, firsts = _number_rows(buffers.ends, buffers.rows, num_rows // 64, threads)
+    rows, *sums = _scatter(buffers, touched, firsts, 1 << (threads - 1).bit_length())
+    indices = torch.from_numpy(rows)[None]
 
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        rows, weights = (value.numpy() for value in ctx.saved_tensors)
-        threads = numba.get_num_threads()
-        touched, firsts = _number_rows(rows, ctx.shape[0] // 64, threads)
-        indices, sums = _scatter(rows, weights, gradients[0].numpy(), touched, firsts, 1 << (threads - 1).bit_length())
-        sparse = torch.sparse_coo_tensor(
-            torch.from_numpy(indices)[None],
-            torch.from_numpy(sums),
-            ctx.shape,
-            check_invariants=False,
-            is_coalesced=True,
-        )
-        return sparse, None, None
+    def sparse(values: Tensor) -> Tensor:
+        shape = num_rows, values.shape[1]
+        return torch.sparse_coo_tensor(indices, values, shape, check_invariants=False, is_coalesced=True)
+
+    density, features = (sparse(torch.from_numpy(values)) for values in sums)
+    return density, features
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _gather(values, rows, weights):
-    out = np.zeros((len(rows), values.shape[1]), np.float32)
-    for i in prange(len(rows)):
-        for c in range(8):
-            row, weight = rows[i, c], weights[i, c]
-            for k in range(values.shape[1]):
-                out[i, k] += weight * values[row, k]
-    return out
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def _number_rows(rows, num_bricks, threads):
+def _number_rows(ends, rows, num_bricks, threads):
     """Which rows of each brick occur, as bits, and how many do in the bricks before."""
-    share = (len(rows) + threads - 1) // threads
     seen = np.zeros((threads, num_bricks), np.int64)
     for thread in prange(threads):
-        for i in range(thread * share, min((thread + 1) * share, len(rows))):
-            for c in range(8):
-                row = rows[i, c]
+        for slot in range(thread, len(ends), threads):
+            for i in range(8 * ends[slot, -1]):
+                row = rows[slot, i]
                 seen[thread, row >> 6] |= np.int64(1) << (row & 63)
     firsts = np.zeros(num_bricks + 1, np.int64)
     for brick in range(num_bricks):
@@ -84,23 +72,35 @@ def _count_bits(bits):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _scatter(rows, weights, gradient, touched, firsts, parts):
+def _scatter(buffers, touched, firsts, parts):
     """Rows that samples touch, ascending, and the sums of their gradients. Each thread goes through all samples, in
     their order, and adds up those of its own bricks: the sums are the same for any number of threads. `parts` is a
     power of two."""
     indices = np.empty(firsts[-1], np.int64)
-    sums = np.zeros((firsts[-1], gradient.shape[1]), np.float32)
+    density, features = np.zeros((firsts[-1], 1), np.float32), np.zeros(firsts[-1] * FEATURES, np.float32)
     for part in prange(parts):
-        for i in range(len(rows)):
-            for c in range(8):
-                row, weight = rows[i, c], weights[i, c]
-                brick, bit = row >> 6, np.int64(1) << (row & 63)
-                if (brick >> 6) & (parts - 1) == part:
-                    slot = firsts[brick] + _count_bits(touched[brick] & (bit - 1))
-                    indices[slot] = row
-                    for k in range(gradient.shape[1]):
-                        sums[slot, k] += weight * gradient[i, k]
-    return indices, sums
+        for slot in range(len(buffers.ends)):
+            _scatter_chunk(buffers, slot, touched, firsts, parts, part, indices, density, features)
+    return indices, density, features.reshape(-1, FEATURES)
+
+
+@njit(cache=True, error_model="numpy")
+def _scatter_chunk(buffers, slot, touched, firsts, parts, part, indices, density, features):
+    gradients = buffers.features[slot]
+    for i in range(buffers.ends[slot, -1]):
+        index = buffers.color_index[slot, i]
+        gradient = load(gradients, FEATURES * max(index, 0))
+        for c in range(8 * i, 8 * i + 8):
+            row, weight = buffers.rows[slot, c], buffers.weights[slot, c]
+            brick, bit = row >> 6, np.int64(1) << (row & 63)
+            if (brick >> 6) & (parts - 1) != part:
+                continue
+            number = firsts[brick] + _count_bits(touched[brick] & (bit - 1))
+            indices[number] = row
+            density[number, 0] += weight * buffers.tau[slot, i]
+            if index >= 0:
+                at = FEATURES * number
+                store(features, at, load(features, at) + splat(weight) * gradient)
 
 
 def adam_rows(
@@ -114,33 +114,55 @@ def adam_rows(
         gradient._coalesced_(True)
     gradient = gradient.coalesce()
     rows, sums = gradient.indices()[0].numpy(), gradient.values().numpy()
+    numbers = map(f32, (lr, *betas, eps, maximum))
+    if values.shape[1] == 1:
+        _adam_density(*(array.reshape(-1) for array in (*arrays, rows, sums)), *numbers)
+        return
+    flat = [array.reshape(-1) for array in arrays]
     if total_variation:
-        _add_total_variation(arrays[0], rows, sums, f32(total_variation))
-    _adam_rows(*arrays, rows, sums, *map(f32, (lr, *betas, eps, maximum)))
+        _add_total_variation(flat[0], rows, sums.reshape(-1), f32(total_variation))
+    _adam_features(*flat, rows, sums.reshape(-1), *numbers)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _adam_rows(values, mean, square, rows, gradient, lr, beta1, beta2, eps, maximum):
+def _adam_density(values, mean, square, rows, gradient, lr, beta1, beta2, eps, maximum):
     for i in prange(len(rows)):
-        row = rows[i]
-        for k in range(values.shape[1]):
-            g = gradient[i, k]
-            mean[row, k] = g + beta1 * (mean[row, k] - g)
-            square[row, k] = g * g + beta2 * (square[row, k] - g * g)
-            values[row, k] = min(values[row, k] - lr * mean[row, k] / (math.sqrt(square[row, k]) + eps), maximum)
+        row, g = rows[i], gradient[i]
+        mean[row] = g + beta1 * (mean[row] - g)
+        square[row] = g * g + beta2 * (square[row] - g * g)
+        values[row] = min(values[row] - lr * mean[row] / (math.sqrt(square[row]) + eps), maximum)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _adam_features(values, mean, square, rows, gradient, lr, beta1, beta2, eps, maximum):
+    beta1, beta2, last = splat(beta1), splat(beta2), len(rows) - 1
+    lr, eps, maximum = splat(lr), splat(eps), splat(maximum)
+    for i in prange(len(rows)):
+        later = FEATURES * rows[min(i + AHEAD, last)]
+        prefetch(values, later)
+        prefetch(mean, later)
+        prefetch(square, later)
+        row, g = FEATURES * rows[i], load(gradient, FEATURES * i)
+        m = g + beta1 * (load(mean, row) - g)
+        s = g * g + beta2 * (load(square, row) - g * g)
+        store(mean, row, m)
+        store(square, row, s)
+        store(values, row, minimum(load(values, row) - lr * m / (sqrt(s) + eps), maximum))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _add_total_variation(values, rows, gradient, weight):
+    weight = splat(weight)
     for i in prange(len(rows)):
-        row = rows[i]
+        row, value = rows[i], load(values, FEATURES * rows[i])
+        differences = splat(f32(0))
         for shift in range(0, 6, 2):
             position, stride = (row >> shift) & 3, 1 << shift
-            for k in range(values.shape[1]):
-                if position < 3:
-                    gradient[i, k] += weight * (values[row, k] - values[row + stride, k])
-                if position > 0:
-                    gradient[i, k] += weight * (values[row, k] - values[row - stride, k])
+            if position < 3:
+                differences += value - load(values, FEATURES * (row + stride))
+            if position > 0:
+                differences += value - load(values, FEATURES * (row - stride))
+        store(gradient, FEATURES * i, load(gradient, FEATURES * i) + weight * differences)
 
 
 def resample(bricks: Tensor, parents: Tensor, values: Tensor) -> Tensor:

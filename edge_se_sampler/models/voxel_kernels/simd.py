@@ -1,0 +1,155 @@
+"""Sixteen float32 numbers as one value in compiled functions: numba leaves loops over them to chance, and processors
+calculate with all sixteen (AVX-512), eight (AVX2) or four (SSE, NEON) at once.
+
+Arrays are one-dimensional, contiguous and of float32, and are not checked for their length.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.extending import intrinsic, lower_builtin, models, register_model
+from numba.core.typing import signature
+from numba.core.typing.templates import ConcreteTemplate, infer_global
+
+LANES = 16
+FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
+"""Freedom of rounding in sums of products, which every number of threads uses alike."""
+_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_VECTOR = ir.VectorType(_FLOAT, LANES)
+_FLAGS = tuple(sorted(FAST))
+
+
+class Vector(types.Type):
+    """The type of such a value."""
+
+    def __init__(self) -> None:
+        super().__init__("float32x16")
+
+
+vector = Vector()
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, fe_type: Any) -> None:
+        super().__init__(manager, fe_type, _VECTOR)
+
+
+def _define_operator(function: Callable, instruction: str) -> None:
+    """Let `function` of two vectors be an instruction of LLVM's."""
+
+    @infer_global(function)
+    class _(ConcreteTemplate):
+        cases = [signature(vector, vector, vector)]
+
+    @lower_builtin(function, vector, vector)
+    def _(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return getattr(builder, instruction)(*args, flags=_FLAGS)
+
+
+for _function, _instruction in (("add", "fadd"), ("iadd", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv")):
+    _define_operator(getattr(operator, _function), _instruction)
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, to: ir.Type) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [offset]), to.as_pointer())
+
+
+def _spread(builder: Any, value: Any) -> Any:
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    one = builder.insert_element(undefined, value, _INT(0))
+    return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
+
+
+@intrinsic
+def load(typing: Any, array: Any, offset: Any) -> Any:
+    """array[offset : offset + 16]."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, sig.args[0], *args, _VECTOR), align=4)
+
+    return vector(array, types.int64), generate
+
+
+@intrinsic
+def store(typing: Any, array: Any, offset: Any, value: Any) -> Any:
+    """array[offset : offset + 16] = value."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        builder.store(args[2], _pointer(context, builder, sig.args[0], *args[:2], _VECTOR), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, vector), generate
+
+
+@intrinsic
+def prefetch(typing: Any, array: Any, offset: Any) -> Any:
+    """Have the processor fetch what will soon be loaded from there."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        byte = ir.IntType(8)
+        kind = ir.FunctionType(ir.VoidType(), [byte.as_pointer(), _INT, _INT, _INT])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [_pointer(context, builder, sig.args[0], *args, byte), _INT(0), _INT(3), _INT(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
+
+
+@intrinsic
+def splat(typing: Any, value: Any) -> Any:
+    """The same number sixteen times."""
+    return vector(types.float32), lambda context, builder, sig, args: _spread(builder, args[0])
+
+
+@intrinsic
+def total(typing: Any, value: Any) -> Any:
+    """The sum of the sixteen numbers."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(_FLOAT, [_FLOAT, _VECTOR])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.fadd.v16f32")
+        return builder.call(function, [ir.Constant(_FLOAT, 0.0), args[0]], fastmath=_FLAGS)
+
+    return types.float32(vector), generate
+
+
+@intrinsic
+def sqrt(typing: Any, value: Any) -> Any:
+    """The square root of each."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), "llvm.sqrt.v16f32"
+        )
+        return builder.call(function, args)
+
+    return vector(vector), generate
+
+
+@intrinsic
+def where_positive(typing: Any, condition: Any, value: Any) -> Any:
+    """Each value where the condition is above 0; else 0."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        zero = ir.Constant(_VECTOR, [0.0] * LANES)
+        return builder.select(builder.fcmp_ordered(">", args[0], zero), args[1], zero)
+
+    return vector(vector, vector), generate
+
+
+@intrinsic
+def minimum(typing: Any, one: Any, other: Any) -> Any:
+    """The lesser of each two."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered("<", *args), *args)
+
+    return vector(vector, vector), generate
