@@ -77,6 +77,9 @@ class ImageBatch:
     @staticmethod
     def _pick(value: Any, drawn: Tensor) -> Tensor:
         position, row, column = drawn.unbind(1)
+        if isinstance(value, Tensor) and value.is_contiguous():  # a third of the time of three indices
+            _, height, width, *_ = value.shape
+            return value.flatten(0, 2).index_select(0, (position * height + row) * width + column)
         if isinstance(value, Tensor):
             return value[position, row, column]
         picked = value[0].new_empty((len(drawn), *value[0].shape[2:]))

@@ -55,51 +55,63 @@ class Cells(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def march_ray(rays, i, cells, buffers, slot, m, c):
-    """Enter the samples of ray i as the m-th, m+1-th, ... of a slot, of which c have a color; returns both numbers
-    after it."""
-    ox, oy, oz = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
-    dx, dy, dz = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
-    begin, end, jitter, step = rays.begin[i], rays.end[i], rays.jitter[i], cells.step
-    inverse_x, inverse_y, inverse_z = _invert(dx), _invert(dy), _invert(dz)
-    steps_per_cell = f32(1) / step
-    last = buffers.t.shape[1] - 1
-    passing, j = f32(1), 0
-    while True:
-        s = begin + (f32(j) + jitter) * step
-        if not s < end:
-            break
-        x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
-        ix, iy, iz = int(x), int(y), int(z)
-        j += 1
-        brick = cells.table[ix >> 2, iy >> 2, iz >> 2]
-        if brick < 0:
-            leave = min(
-                _leave(ix >> 2, -brick, ox, inverse_x),
-                _leave(iy >> 2, -brick, oy, inverse_y),
-                _leave(iz >> 2, -brick, oz, inverse_z),
-            )
-            # rounded down, and one less: rounding must not skip a cell
-            j = max(j, int((leave - begin) * steps_per_cell - jitter))
-            continue
-        cell = ((ix & 3) << 4) | ((iy & 3) << 2) | (iz & 3)
-        if not (cells.sampled[brick] >> cell) & 1:
-            continue
-        k = min(m, last)  # beyond the capacity, samples are only counted
-        raw = _interpolate_density(x - f32(ix), y - f32(iy), z - f32(iz), brick, cell, cells, buffers, slot, k)
-        if raw > cells.density_min:
-            tau = math.exp(raw) * cells.density_scale
-            transparency = math.exp(-tau)
-            buffers.t[slot, k], buffers.tau[slot, k], buffers.passing[slot, k] = s, tau, passing
-            buffers.color_index[slot, k] = -1
-            if passing * (f32(1) - transparency) > cells.weight_min:
-                buffers.color_index[slot, k] = min(c, last)
-                c += 1
-            m += 1
-            passing *= transparency
-            if passing < cells.transmittance_min:
+def march_chunk(rays, first, last, cells, buffers, slot):
+    """Enter the samples of rays first .. last - 1 into a slot; returns how many there are, even if there is no room
+    for all."""
+    # whatever is taken out of a tuple within the loops would be counted as a reference each time
+    origins, directions, begins, ends, jitters = rays
+    table, neighbors, sampled, density, step, density_scale, density_min, weight_min, transmittance_min = cells
+    rows, weights, t, tau = buffers.rows[slot], buffers.weights[slot], buffers.t[slot], buffers.tau[slot]
+    light, color_index, of_ray = buffers.passing[slot], buffers.color_index[slot], buffers.ends[slot]
+    room, steps_per_cell = len(t) - 1, f32(1) / step
+    m, c = 0, 0
+    for i in range(first, last):
+        ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        begin, end, jitter = begins[i], ends[i], jitters[i]
+        inverse_x, inverse_y, inverse_z = _invert(dx), _invert(dy), _invert(dz)
+        passing, j = f32(1), 0
+        while True:
+            s = begin + (f32(j) + jitter) * step
+            if not s < end:
                 break
-    return m, c
+            x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
+            ix, iy, iz = int(x), int(y), int(z)
+            j += 1
+            brick = table[ix >> 2, iy >> 2, iz >> 2]
+            if brick < 0:
+                leave = min(
+                    _leave(ix >> 2, -brick, ox, inverse_x),
+                    _leave(iy >> 2, -brick, oy, inverse_y),
+                    _leave(iz >> 2, -brick, oz, inverse_z),
+                )
+                # rounded down, and one less: rounding must not skip a cell
+                j = max(j, int((leave - begin) * steps_per_cell - jitter))
+                continue
+            cell = ((ix & 3) << 4) | ((iy & 3) << 2) | (iz & 3)
+            if not (sampled[brick] >> cell) & 1:
+                continue
+            k = min(m, room)  # beyond the capacity, samples are only counted
+            _set_weights(x - f32(ix), y - f32(iy), z - f32(iz), weights, 8 * k)
+            raw = f32(0)
+            for corner in range(8):
+                row = neighbors[brick, NEIGHBOR[cell, corner]] * 64 + CORNER[cell, corner]
+                rows[8 * k + corner] = row
+                raw += weights[8 * k + corner] * density[row]
+            if raw > density_min:
+                t[k], tau[k], light[k], color_index[k] = s, math.exp(raw) * density_scale, passing, -1
+                transparency = math.exp(-tau[k])
+                if passing * (f32(1) - transparency) > weight_min:
+                    color_index[k] = min(c, room)
+                    c += 1
+                m += 1
+                passing *= transparency
+                if passing < transmittance_min:
+                    break
+        of_ray[i - first] = m
+    of_ray[last - first :] = m
+    buffers.num_colored[slot] = c
+    return m
 
 
 @njit(cache=True, inline="always")
@@ -115,19 +127,12 @@ def _leave(brick, distance, origin, inverse):
 
 
 @njit(cache=True, inline="always")
-def _interpolate_density(x, y, z, brick, cell, cells, buffers, slot, k):
-    rows, weights = buffers.rows, buffers.weights
-    u, v, w, k = f32(1) - x, f32(1) - y, f32(1) - z, 8 * k
+def _set_weights(x, y, z, weights, k):
+    """Enter the shares of a cell's corners at a position in it."""
+    u, v, w = f32(1) - x, f32(1) - y, f32(1) - z
     uv, uy, xv, xy = u * v, u * y, x * v, x * y
-    weights[slot, k], weights[slot, k + 1], weights[slot, k + 2] = uv * w, uv * z, uy * w
-    weights[slot, k + 3], weights[slot, k + 4], weights[slot, k + 5] = uy * z, xv * w, xv * z
-    weights[slot, k + 6], weights[slot, k + 7] = xy * w, xy * z
-    raw = f32(0)
-    for corner in range(8):
-        row = cells.neighbors[brick, NEIGHBOR[cell, corner]] * 64 + CORNER[cell, corner]
-        rows[slot, k + corner] = row
-        raw += weights[slot, k + corner] * cells.density[row]
-    return raw
+    weights[k], weights[k + 1], weights[k + 2], weights[k + 3] = uv * w, uv * z, uy * w, uy * z
+    weights[k + 4], weights[k + 5], weights[k + 6], weights[k + 7] = xv * w, xv * z, xy * w, xy * z
 
 
 def find_dense_cells(grid: BrickGrid, density: Tensor, least: float) -> Tensor:

@@ -14,7 +14,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from edge_se_sampler.models.voxel_kernels.buffers import CHUNK, FEATURES, HARMONICS, WIDTH, Buffers
-from edge_se_sampler.models.voxel_kernels.marching import Cells, Rays, march_ray
+from edge_se_sampler.models.voxel_kernels.marching import Cells, Rays, march_chunk
 from edge_se_sampler.models.voxel_kernels.rows import interpolate, sum_row_gradients
 from edge_se_sampler.models.voxel_kernels.shading import (
     Network,
@@ -104,7 +104,7 @@ def _render(rays, cells, features, network, buffers, rgb, accumulation, distance
     for slot in prange(slots):
         for first in range(slot * CHUNK, num_rays, slots * CHUNK):
             last = min(first + CHUNK, num_rays)
-            most[slot] = max(most[slot], _march_chunk(rays, first, last, cells, buffers, slot))
+            most[slot] = max(most[slot], march_chunk(rays, first, last, cells, buffers, slot))
             if most[slot] <= buffers.t.shape[1]:
                 _shade_chunk(rays, first, features, network, buffers, slot)
                 _composite_chunk(first, last, buffers, slot, rgb, accumulation, distance)
@@ -112,35 +112,26 @@ def _render(rays, cells, features, network, buffers, rgb, accumulation, distance
 
 
 @njit(cache=True, error_model="numpy")
-def _march_chunk(rays, first, last, cells, buffers, slot):
-    m, c = 0, 0
-    for i in range(first, last):
-        m, c = march_ray(rays, i, cells, buffers, slot, m, c)
-        buffers.ends[slot, i - first] = m
-    buffers.ends[slot, last - first :] = m
-    buffers.num_colored[slot] = c
-    return m
-
-
-@njit(cache=True, error_model="numpy")
 def _shade_chunk(rays, first, features, network, buffers, slot):
     """Colors of the samples that have one: first all features, so that the processor waits for many at once."""
-    start, view, harmonics = 0, buffers.of_ray[slot], buffers.harmonics[slot]
-    for k in range(buffers.ends[slot, -1]):
-        if buffers.color_index[slot, k] >= 0:
-            of_sample = FEATURES * buffers.color_index[slot, k]
-            interpolate(features, buffers.rows[slot], buffers.weights[slot], 8 * k, buffers.features[slot], of_sample)
+    view, harmonics, hidden = buffers.of_ray[slot], buffers.harmonics[slot], buffers.hidden[slot]
+    rows, weights, color_index = buffers.rows[slot], buffers.weights[slot], buffers.color_index[slot]
+    directions, ends, color, of_samples = rays.directions, buffers.ends[slot], buffers.color[slot], buffers.features[slot]
+    for k in range(ends[-1]):
+        if color_index[k] >= 0:
+            interpolate(features, rows, weights, 8 * k, of_samples, FEATURES * color_index[k])
+    start = 0
     for ray in range(CHUNK):
-        end, seen = buffers.ends[slot, ray], False
+        end, seen = ends[ray], False
         for k in range(start, end):
-            index = buffers.color_index[slot, k]
+            index = color_index[k]
             if index < 0:
                 continue
             if not seen:
                 i, seen = first + ray, True
-                x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
+                x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
                 start_ray(x, y, z, network, harmonics, view, ray)
-            shade(buffers.features[slot], network, view, ray, buffers.hidden[slot], buffers.color[slot], index)
+            shade(of_samples, network, view, ray, hidden, color, index)
         start = end
 
 

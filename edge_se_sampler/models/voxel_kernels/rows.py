@@ -167,13 +167,14 @@ def _add_total_variation(values, rows, gradient, weight):
 
 def resample(bricks: Tensor, parents: Tensor, values: Tensor) -> Tensor:
     """As `voxel_ops.resample`."""
-    return torch.from_numpy(_resample(*(value.detach().numpy() for value in (bricks, parents, values))))
+    fine = torch.zeros((64 * len(bricks), values.shape[1]))
+    _resample(*(value.detach().numpy() for value in (bricks, parents, values, fine)))
+    return fine
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _resample(bricks, parents, values):
+def _resample(bricks, parents, values, fine):
     """Values (64 K, F) at corners, of those at the corners of cells twice as large that surround them."""
-    fine = np.zeros((64 * len(bricks), values.shape[1]), np.float32)
     for brick in prange(len(bricks)):
         for cell in range(64):
             x = 4 * bricks[brick, 0] + (cell >> 4)
@@ -192,4 +193,3 @@ def _resample(bricks, parents, values):
                                 fine[row, f] += values[coarse, f]
             for f in range(values.shape[1]):
                 fine[row, f] /= f32(max(found, 1))
-    return fine
