@@ -215,7 +215,7 @@ class VoxelModelConfig(ModelConfig):
     """Leave out what lies outside the visual hull of the alpha masks."""
     step_size_voxels: float = 1.0
     """Distance between samples, as a multiple of a cell's size."""
-    alpha_threshold: float = 0.008
+    alpha_threshold: float = 0.02
     """Samples of less opacity are left out."""
     weight_threshold: float = 0.004
     """Samples that count less in their ray's color are not asked for one."""
@@ -223,11 +223,11 @@ class VoxelModelConfig(ModelConfig):
     """A ray ends where less of its light passes."""
     prune_weight: float = 0.02
     """Cells that never counted more in a ray's color are pruned."""
-    density_lr_scale: float = 60.0
+    density_lr_scale: float = 30.0
     """Learning rate of the density, as a multiple of the network's."""
     feature_lr_scale: float = 20.0
     """Learning rate of the features, as a multiple of the network's."""
-    total_variation: float = 1e-4
+    total_variation: float = 3e-5
     """How much, beside a ray's squared error, squared differences between features of neighboring corners count."""
     alpha_loss: float = 0.3
     """How much, beside a ray's squared error, that of its opacity against alpha counts: else what has the background's
