@@ -66,7 +66,7 @@ def render(ops: ModuleType, marching: Marching = MARCHING) -> Rendered:
 def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-4) -> None:
     """Equal to a part of the largest value."""
     assert found.shape == expected.shape
-    assert float((found - expected).abs().max()) <= tolerance * float(expected.abs().max())
+    assert float((found - expected).detach().abs().max()) <= tolerance * float(expected.abs().max())
 
 
 @pytest.mark.parametrize("step", [0.3, 1.0, 2.5])
@@ -131,6 +131,7 @@ def test_two_renderings_before_a_backward_pass_do_not_share_memory() -> None:
     both, features.grad = features.grad.to_dense(), None
     rendered(0.1).backward()
     rendered(0.8).backward()
+    assert features.grad is not None
     assert_close(features.grad.to_dense(), both, 1e-5)
 
 
@@ -173,9 +174,9 @@ def test_any_number_of_threads_finds_the_same_bits() -> None:
 @pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
 def test_a_step_of_adam_moves_the_rows_of_the_gradient_alone(ops: ModuleType) -> None:
     """Twice, and with a row that occurs twice; the largest allowed value is kept."""
-    values, mean, square = random_tensor(128, 16), torch.zeros(128, 16), torch.zeros(128, 16)
+    values, mean, square = random_tensor(128, 16), torch.zeros(128, 16), torch.zeros(128, 1)
     expected = values.double().clone()
-    m, v = torch.zeros_like(expected), torch.zeros_like(expected)
+    m, v = torch.zeros_like(expected), torch.zeros_like(expected[:, :1])
     for seed in (1, 2):
         rows, sums = torch.tensor([70, 3, 127, 3]), random_tensor(4, 16, seed=seed)
         gradient = torch.sparse_coo_tensor(rows[None], sums, (128, 16), check_invariants=True)
@@ -189,7 +190,7 @@ def test_a_step_of_adam_moves_the_rows_of_the_gradient_alone(ops: ModuleType) ->
         before = expected.clone()
         for row in (3, 70, 127):
             m[row] = 0.9 * m[row] + 0.1 * dense[row]
-            v[row] = 0.99 * v[row] + 0.01 * dense[row] ** 2
+            v[row] = 0.99 * v[row] + 0.01 * dense[row].square().mean()
             expected[row] = (before[row] - 0.1 * m[row] / (v[row].sqrt() + 1e-8)).clamp(max=1.0)
         torch.testing.assert_close(values.double(), expected, rtol=1e-5, atol=1e-5)
         expected = values.double().clone()
@@ -238,6 +239,8 @@ def losses(ops: ModuleType, monkeypatch: pytest.MonkeyPatch, steps: int = 50) ->
     monkeypatch.setattr(voxels, "compiled_ops", lambda: ops)
     config: TrainerConfig = method_configs()["voxel-nerf"]
     changes = {f"{MANAGER}.train_num_rays_per_batch": 64, f"{MODEL}.voxel_size_px": 0.5}
+    # a sample at a threshold falls on one side or the other by rounding, and has to matter little
+    changes |= {f"{MODEL}.{name}_threshold": 1e-5 for name in ("alpha", "weight", "transmittance")}
     trainer = tiny_trainer(override(config, changes | {"max_num_iterations": steps}), VIEWS)
     found = [trainer.train_iteration(step) for step in range(steps)]
     assert int(trainer.pipeline.model.grid.level) == 2

@@ -19,7 +19,8 @@ TOTAL_VARIATION_INTERVAL = 4
 
 class RowAdam(torch.optim.Adam):
     """torch's Adam; of weights that have a sparse gradient, only the rows that it has are moved, by Adam without bias
-    correction, and their running means are only then updated (as DVGO's and torch's SparseAdam do).
+    correction, and their running means are only then updated (as DVGO's and torch's SparseAdam do); that of the squared
+    gradients is one for all of a row.
 
     Groups may have `maximum`, the largest value of such rows, and `total_variation`, by which the differences between
     a row and its neighbors in its brick count in its gradient.
@@ -38,7 +39,7 @@ class RowAdam(torch.optim.Adam):
         state, interval = self.state[weight], TOTAL_VARIATION_INTERVAL
         if not state:
             state["step"] = torch.tensor(0.0)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weight), torch.zeros_like(weight)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weight), torch.zeros_like(weight[:, :1])
         state["step"] += 1
         choose_ops(weight).adam_rows(
             weight,

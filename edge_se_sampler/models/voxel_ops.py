@@ -81,7 +81,7 @@ class Rendered:
     distance: Tensor
     """(n, 1): weights times distances of samples, in sides of a cell; without a gradient."""
     cells: Tensor
-    """(c,) int64: rows of the cells of the samples that have a color; kernels leave it empty where nothing is trained."""
+    """(c,) int64: rows of the cells of samples that have a color; kernels leave it empty where nothing is trained."""
     weights: Tensor
     """(c,): weights of those in their ray's color; without a gradient."""
 
@@ -103,7 +103,9 @@ def render(
     values = interpolate(features, samples.rows, samples.weights)[colored]
     color = shade(values, spans.directions, samples.ray_indices[colored], network)
     rgb, accumulation, weights = composite(tau, color, samples, num_rays)
-    distance = torch.zeros_like(accumulation[:, 0]).index_add(0, samples.ray_indices[colored], samples.t[colored] * weights)
+    distance = torch.zeros_like(accumulation[:, 0]).index_add(
+        0, samples.ray_indices[colored], samples.t[colored] * weights
+    )
     return Rendered(rgb, accumulation, distance[:, None], samples.rows[colored, 0].long(), weights)
 
 
@@ -242,7 +244,7 @@ def adam_rows(
 
     Args:
         mean: (64 K, F) running mean of the gradients.
-        square: (64 K, F) running mean of their squares.
+        square: (64 K, 1) running mean of their squares, over the F values, too: less memory, the same result.
         maximum: what values become at most.
         total_variation: weight of the squared differences to neighbors in the same brick, half of which each row adds
             to the loss.
@@ -252,7 +254,7 @@ def adam_rows(
     if total_variation:
         gradient = gradient + total_variation * difference_to_neighbors(values, rows)
     mean[rows] = torch.lerp(gradient, mean[rows], betas[0])
-    square[rows] = torch.lerp(gradient.square(), square[rows], betas[1])
+    square[rows] = torch.lerp(gradient.square().mean(dim=1, keepdim=True), square[rows], betas[1])
     values[rows] = (values[rows] - lr * mean[rows] / (square[rows].sqrt() + eps)).clamp(max=maximum)
 
 

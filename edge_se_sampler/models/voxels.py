@@ -42,8 +42,8 @@ STEPS_PER_SAMPLED = 50
 """Steps after which cells that have become transparent are found again."""
 TRANSPARENT_MARGIN = 0.7
 """How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
-BYTES_PER_ROW = 4 * (3 * (FEATURE_DIM + 1) + 2) + 1
-"""Density, features, their two running means, and what the grid and the kernels keep of a row."""
+BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
+"""Density, features, the running means of their gradients and those of squares, and what the grid keeps of a row."""
 
 
 def choose_ops(weight: Tensor) -> ModuleType:
@@ -78,7 +78,7 @@ def compile_ops(device: str) -> None:
     loss.sum().backward()
     for weight in (model.density, model.features):
         rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
-        ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight), weight.grad, **rows)
+        ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
         ops.find_dense_cells(grid, weight.data, 0.0)
         ops.resample(grid.subdivide(cells.bool()).bricks, grid.numbers, weight.data)
     if time.monotonic() - began > 5:

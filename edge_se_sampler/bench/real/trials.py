@@ -29,10 +29,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no alpha loss": {f"{MODEL}.alpha_loss": 0.0},
     "random background": {f"{MODEL}.background_color": "random"},
     "half the thresholds": {
-        f"{MODEL}.alpha_threshold": 0.004,
+        f"{MODEL}.alpha_threshold": 0.01,
         f"{MODEL}.weight_threshold": 0.002,
         f"{MODEL}.transmittance_threshold": 0.003,
     },
+    "cells of 0.75 pixels": {f"{MODEL}.voxel_size_px": 0.75},
 }
 """What is changed, by label."""
 

@@ -30,7 +30,7 @@ class Buffers(NamedTuple):
     color_weight: np.ndarray  # (S, M)
     color_cell: np.ndarray  # (S, M) int32: row of the sample's cell
     harmonics: np.ndarray  # (S, HARMONICS CHUNK)
-    of_ray: np.ndarray  # (S, WIDTH CHUNK): its direction's part of the hidden layer; in the backward pass it becomes its gradient
+    of_ray: np.ndarray  # (S, WIDTH CHUNK): a direction's part of the hidden layer; in the backward pass its gradient
 
     @classmethod
     def allocate(cls, slots: int, samples: int) -> Buffers:

@@ -11,7 +11,6 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from edge_se_sampler.models.voxel_kernels.buffers import Buffers
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans
 from edge_se_sampler.occupancy.bricks import CORNERS, BrickGrid
 
@@ -49,9 +48,18 @@ class Cells(NamedTuple):
 
     @classmethod
     def of(cls, grid: BrickGrid, density: Tensor, marching: Marching) -> Cells:
-        arrays = (value.detach().numpy() for value in (grid.table, grid.neighbors, grid.sampled, density[:, 0]))
-        names = ("step", "density_scale", "density_min", "weight_min", "transmittance_min")
-        return cls(*arrays, *(f32(getattr(marching, name)) for name in names))
+        table, neighbors, sampled = (value.numpy() for value in (grid.table, grid.neighbors, grid.sampled))
+        return cls(
+            table,
+            neighbors,
+            sampled,
+            density.detach().numpy()[:, 0],
+            f32(marching.step),
+            f32(marching.density_scale),
+            f32(marching.density_min),
+            f32(marching.weight_min),
+            f32(marching.transmittance_min),
+        )
 
 
 @njit(cache=True, error_model="numpy")

@@ -25,11 +25,11 @@ from edge_se_sampler.models.voxel_kernels.shading import (
     shade_backward,
     start_ray,
 )
-from edge_se_sampler.models.voxel_kernels.simd import FAST
+from edge_se_sampler.models.voxel_kernels.simd import CONTRACT
 from edge_se_sampler.models.voxel_ops import Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid
 
-SAMPLES_PER_RAY = 64
+SAMPLES_PER_RAY = 16
 """Of a chunk, which there is room for at first."""
 f32 = np.float32
 _spare: list[Buffers] = []
@@ -60,9 +60,9 @@ class _Render(torch.autograd.Function):
             buffers = _take(slots, samples)
             outputs = [np.empty((len(rays.begin), size), np.float32) for size in (3, 1, 1)]
             found = _render(rays, cells, features.detach().numpy().reshape(-1), network, buffers, *outputs)
-            if found <= buffers.t.shape[1]:
+            if found < buffers.t.shape[1]:  # beside those found, one that is looked at
                 break
-            samples = found
+            samples = int(1.25 * found)
         seen = _collect_seen(buffers) if keep else (np.empty(0, np.int64), np.empty(0, np.float32))
         ctx.arrays, ctx.num_rows = (outputs[1], network, buffers), len(density)
         if not keep:
@@ -105,7 +105,7 @@ def _render(rays, cells, features, network, buffers, rgb, accumulation, distance
         for first in range(slot * CHUNK, num_rays, slots * CHUNK):
             last = min(first + CHUNK, num_rays)
             most[slot] = max(most[slot], march_chunk(rays, first, last, cells, buffers, slot))
-            if most[slot] <= buffers.t.shape[1]:
+            if most[slot] < buffers.t.shape[1]:
                 _shade_chunk(rays, first, features, network, buffers, slot)
                 _composite_chunk(first, last, buffers, slot, rgb, accumulation, distance)
     return most.max() if slots else 0
@@ -116,7 +116,12 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
     """Colors of the samples that have one: first all features, so that the processor waits for many at once."""
     view, harmonics, hidden = buffers.of_ray[slot], buffers.harmonics[slot], buffers.hidden[slot]
     rows, weights, color_index = buffers.rows[slot], buffers.weights[slot], buffers.color_index[slot]
-    directions, ends, color, of_samples = rays.directions, buffers.ends[slot], buffers.color[slot], buffers.features[slot]
+    directions, ends, color, of_samples = (
+        rays.directions,
+        buffers.ends[slot],
+        buffers.color[slot],
+        buffers.features[slot],
+    )
     for k in range(ends[-1]):
         if color_index[k] >= 0:
             interpolate(features, rows, weights, 8 * k, of_samples, FEATURES * color_index[k])
@@ -135,7 +140,7 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
         start = end
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT)
 def _composite_chunk(first, last, buffers, slot, rgb, accumulation, distance):
     start = 0
     for i in range(first, last):
@@ -177,7 +182,7 @@ def _render_backward(d_rgb, d_accumulation, accumulation, network, transposed, b
         _shade_chunk_backward(slot, network, transposed, buffers, gradient)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT)
 def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers):
     start, first = 0, slot * CHUNK
     for i in range(first, min(first + CHUNK, len(d_rgb))):

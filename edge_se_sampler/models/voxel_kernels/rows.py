@@ -5,6 +5,7 @@ written to."""
 from __future__ import annotations
 
 import math
+
 import numba
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from edge_se_sampler.models.voxel_kernels.buffers import FEATURES, Buffers
-from edge_se_sampler.models.voxel_kernels.simd import load, minimum, prefetch, splat, sqrt, store
+from edge_se_sampler.models.voxel_kernels.simd import load, minimum, prefetch, splat, store, total
 
 AHEAD = 8
 """Rows that are fetched into the cache before they are needed."""
@@ -135,19 +136,18 @@ def _adam_density(values, mean, square, rows, gradient, lr, beta1, beta2, eps, m
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _adam_features(values, mean, square, rows, gradient, lr, beta1, beta2, eps, maximum):
-    beta1, beta2, last = splat(beta1), splat(beta2), len(rows) - 1
-    lr, eps, maximum = splat(lr), splat(eps), splat(maximum)
+    beta1, maximum, last = splat(beta1), splat(maximum), len(rows) - 1
     for i in prange(len(rows)):
         later = FEATURES * rows[min(i + AHEAD, last)]
         prefetch(values, later)
         prefetch(mean, later)
-        prefetch(square, later)
         row, g = FEATURES * rows[i], load(gradient, FEATURES * i)
         m = g + beta1 * (load(mean, row) - g)
-        s = g * g + beta2 * (load(square, row) - g * g)
+        s = total(g * g) * f32(1 / FEATURES)
+        s = s + beta2 * (square[rows[i]] - s)
         store(mean, row, m)
-        store(square, row, s)
-        store(values, row, minimum(load(values, row) - lr * m / (sqrt(s) + eps), maximum))
+        square[rows[i]] = s
+        store(values, row, minimum(load(values, row) - splat(lr / (math.sqrt(s) + eps)) * m, maximum))
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

@@ -4,6 +4,7 @@ calculate with all sixteen (AVX-512), eight (AVX2) or four (SSE, NEON) at once.
 Arrays are one-dimensional, contiguous and of float32, and are not checked for their length.
 """
 
+# pyright: reportCallIssue=false, reportOptionalCall=false
 from __future__ import annotations
 
 import operator
@@ -14,15 +15,13 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.extending import intrinsic, lower_builtin, models, register_model
-from numba.core.typing import signature
-from numba.core.typing.templates import ConcreteTemplate, infer_global
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 
 LANES = 16
-FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
-"""Freedom of rounding in sums of products, which every number of threads uses alike."""
+CONTRACT = {"contract"}
+"""A product and a sum may be rounded together. No other freedom: what is compiled would depend on what is around it."""
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
-_FLAGS = tuple(sorted(FAST))
 
 
 class Vector(types.Type):
@@ -46,18 +45,19 @@ def _define_operator(function: Callable, instruction: str) -> None:
 
     @infer_global(function)
     class _(ConcreteTemplate):
-        cases = [signature(vector, vector, vector)]
+        cases = (signature(vector, vector, vector),)
 
     @lower_builtin(function, vector, vector)
     def _(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, instruction)(*args, flags=_FLAGS)
+        return getattr(builder, instruction)(*args, flags=tuple(CONTRACT))
 
 
-for _function, _instruction in (("add", "fadd"), ("iadd", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv")):
-    _define_operator(getattr(operator, _function), _instruction)
+_INSTRUCTIONS = {"add": "fadd", "iadd": "fadd", "sub": "fsub", "mul": "fmul"}
+for _name, _instruction in _INSTRUCTIONS.items():
+    _define_operator(getattr(operator, _name), _instruction)
 
 
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, to: ir.Type) -> Any:
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, offset: Any, to: Any) -> Any:
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [offset]), to.as_pointer())
 
@@ -116,22 +116,9 @@ def total(typing: Any, value: Any) -> Any:
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_FLOAT, [_FLOAT, _VECTOR])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.fadd.v16f32")
-        return builder.call(function, [ir.Constant(_FLOAT, 0.0), args[0]], fastmath=_FLAGS)
+        return builder.call(function, [ir.Constant(_FLOAT, 0.0), args[0]], fastmath=("reassoc",))
 
     return types.float32(vector), generate
-
-
-@intrinsic
-def sqrt(typing: Any, value: Any) -> Any:
-    """The square root of each."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), "llvm.sqrt.v16f32"
-        )
-        return builder.call(function, args)
-
-    return vector(vector), generate
 
 
 @intrinsic
