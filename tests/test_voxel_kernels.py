@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -233,6 +234,27 @@ assert signatures() == compiled, (compiled, signatures())
 
 def test_nothing_is_left_to_compile_when_the_clock_runs() -> None:
     subprocess.run([sys.executable, "-c", COMPILED], check=True, cwd=Path(__file__).parent)
+
+
+LOSSES = """
+import pytest
+from test_voxel_kernels import losses, voxel_kernels
+with pytest.MonkeyPatch.context() as monkeypatch:
+    print(losses(voxel_kernels, monkeypatch))
+"""
+
+
+@pytest.mark.slow
+def test_kernels_that_have_just_been_compiled_round_as_those_that_are_loaded(tmp_path: Path) -> None:
+    """Else a training would not be repeated by another process."""
+    command, environment = [sys.executable, "-c", LOSSES], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    folder = Path(__file__).parent
+    compiled, loaded = (
+        subprocess.run(command, check=True, cwd=folder, env=environment, capture_output=True, text=True).stdout
+        for _ in range(2)
+    )
+    assert compiled == loaded
+    assert compiled.count(",") == 49
 
 
 def losses(ops: ModuleType, monkeypatch: pytest.MonkeyPatch, steps: int = 50) -> list[float]:

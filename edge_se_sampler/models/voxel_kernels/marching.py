@@ -66,11 +66,10 @@ class Cells(NamedTuple):
 def march_chunk(rays, first, last, cells, buffers, slot):
     """Enter the samples of rays first .. last - 1 into a slot; returns how many there are, even if there is no room
     for all."""
-    # whatever is taken out of a tuple within the loops would be counted as a reference each time
     origins, directions, begins, ends, jitters = rays
     table, neighbors, sampled, density, step, density_scale, density_min, weight_min, transmittance_min = cells
     rows, weights, t, tau = buffers.rows[slot], buffers.weights[slot], buffers.t[slot], buffers.tau[slot]
-    light, color_index, of_ray = buffers.passing[slot], buffers.color_index[slot], buffers.ends[slot]
+    light, color_index, sample_ends = buffers.passing[slot], buffers.color_index[slot], buffers.ends[slot]
     room, steps_per_cell = len(t) - 1, f32(1) / step
     m, c = 0, 0
     for i in range(first, last):
@@ -116,8 +115,8 @@ def march_chunk(rays, first, last, cells, buffers, slot):
                 passing *= transparency
                 if passing < transmittance_min:
                     break
-        of_ray[i - first] = m
-    of_ray[last - first :] = m
+        sample_ends[i - first] = m
+    sample_ends[last - first :] = m
     buffers.num_colored[slot] = c
     return m
 

@@ -79,6 +79,7 @@ class _Render(torch.autograd.Function):
         transposed = network.hidden.reshape(FEATURES, WIDTH).T.ravel()
         _render_backward(d_rgb, d_accumulation, accumulation, network, transposed, buffers, of_network)
         of_rows = sum_row_gradients(buffers, ctx.num_rows)
+        del ctx.arrays  # the buffers hold gradients now: there is no second backward pass
         _spare.append(buffers)
         shapes = (FEATURES, WIDTH), (HARMONICS, WIDTH), (WIDTH,), (3, WIDTH), (3,)
         of_weights = (torch.from_numpy(value.sum(0)).reshape(s) for value, s in zip(of_network, shapes, strict=True))
@@ -99,7 +100,6 @@ def _render(rays, cells, features, network, buffers, rgb, accumulation, distance
     """Render all rays; each slot takes every so manieth chunk. Returns the most samples that a chunk has: if there is
     no room for them, nothing else is of use."""
     slots, num_rays = len(buffers.ends), len(rays.begin)
-    buffers.ends[:], buffers.num_colored[:] = 0, 0
     most = np.zeros(slots, np.int64)
     for slot in prange(slots):
         for first in range(slot * CHUNK, num_rays, slots * CHUNK):
