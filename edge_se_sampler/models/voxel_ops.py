@@ -103,10 +103,9 @@ def render(
     values = interpolate(features, samples.rows, samples.weights)[colored]
     color = shade(values, spans.directions, samples.ray_indices[colored], network)
     rgb, accumulation, weights = composite(tau, color, samples, num_rays)
-    distance = torch.zeros_like(accumulation[:, 0]).index_add(
-        0, samples.ray_indices[colored], samples.t[colored] * weights
-    )
-    return Rendered(rgb, accumulation, distance[:, None], samples.rows[colored, 0].long(), weights)
+    distance = torch.zeros_like(accumulation)
+    distance.index_add_(0, samples.ray_indices[colored], (samples.t[colored] * weights)[:, None])
+    return Rendered(rgb, accumulation, distance, samples.rows[colored, 0].long(), weights)
 
 
 def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | None, marching: Marching) -> Samples:

@@ -116,12 +116,7 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
     """Colors of the samples that have one: first all features, so that the processor waits for many at once."""
     view, harmonics, hidden = buffers.of_ray[slot], buffers.harmonics[slot], buffers.hidden[slot]
     rows, weights, color_index = buffers.rows[slot], buffers.weights[slot], buffers.color_index[slot]
-    directions, ends, color, of_samples = (
-        rays.directions,
-        buffers.ends[slot],
-        buffers.color[slot],
-        buffers.features[slot],
-    )
+    ends, color, of_samples = buffers.ends[slot], buffers.color[slot], buffers.features[slot]
     for k in range(ends[-1]):
         if color_index[k] >= 0:
             interpolate(features, rows, weights, 8 * k, of_samples, FEATURES * color_index[k])
@@ -134,7 +129,7 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
                 continue
             if not seen:
                 i, seen = first + ray, True
-                x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+                x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
                 start_ray(x, y, z, network, harmonics, view, ray)
             shade(of_samples, network, view, ray, hidden, color, index)
         start = end

@@ -127,12 +127,8 @@ def add_outer_products(inputs, outputs, count, gradient):
     for k in range(0, 16, 2):
         for j in range(0, WIDTH, 32):
             at, below = WIDTH * k + j, WIDTH * k + j + WIDTH
-            a0, a1, b0, b1 = (
-                load(gradient, at),
-                load(gradient, at + 16),
-                load(gradient, below),
-                load(gradient, below + 16),
-            )
+            a0, a1 = load(gradient, at), load(gradient, at + 16)
+            b0, b1 = load(gradient, below), load(gradient, below + 16)
             for i in range(count):
                 a, b = splat(inputs[16 * i + k]), splat(inputs[16 * i + k + 1])
                 d0, d1 = load(outputs, WIDTH * i + j), load(outputs, WIDTH * i + j + 16)
