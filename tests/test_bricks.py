@@ -14,7 +14,7 @@ def random_cells(share: float = 0.02, shape: tuple[int, int, int] = (21, 9, 14))
 
 
 def grid_of(cells: torch.Tensor, max_level: int = 2) -> BrickGrid:
-    return BrickGrid(torch.tensor([-1.0, 0.0, 2.0]), 0.5, cells, max_level)
+    return BrickGrid.from_cells(torch.tensor([-1.0, 0.0, 2.0]), 0.5, cells, max_level)
 
 
 @pytest.mark.parametrize("share", [0.001, 0.02, 1.0])
@@ -58,21 +58,25 @@ def test_the_table_has_bricks_or_the_distance_to_the_next() -> None:
     assert int(grid.table[4, 1, 1]) == -1
 
 
-def test_subdividing_keeps_the_place_of_what_is_kept() -> None:
-    cells = random_cells()
+@pytest.mark.parametrize("ratio", [0.25, 0.3, 0.5, 0.8])
+def test_smaller_cells_are_those_in_and_next_to_what_is_kept(ratio: float) -> None:
+    cells = random_cells(0.1)
     kept = cells & random_cells(0.5)
-    finer = grid_of(cells).subdivide(kept)
-    assert float(finer.cell_size) == 0.25
-    assert int(finer.level) == 1
-    assert int(finer.max_level) == 2
-    found = finer.to_cells(finer.occupied.reshape(-1))
-    assert int(found.sum()) == 8 * int(kept.sum())
-    assert torch.equal(found[::2, 1::2, ::2], kept)
+    finer = grid_of(cells).subdivide(kept, 0.5 * ratio)
+    size = torch.ceil(torch.tensor(cells.shape) / ratio - 1e-6).long().tolist()
+    assert finer.size.tolist() == size
+    axes = [
+        ((torch.arange(n) + 0.5) * ratio).long().clamp(max=most - 1) for n, most in zip(size, cells.shape, strict=True)
+    ]
+    where = torch.meshgrid(*axes, indexing="ij")
+    assert torch.equal(finer.to_cells(finer.occupied.reshape(-1)), dilate(kept[where]) & cells[where])
     assert finer.is_of_the_same_scene(grid_of(cells))
+    assert float(finer.cell_size) == 0.5 * ratio
+    assert (int(finer.level), int(finer.max_level)) == (1, 2)
 
 
 def test_a_grid_from_its_state_is_the_same_and_of_the_same_scene() -> None:
-    grid = grid_of(random_cells()).subdivide(random_cells())
+    grid = grid_of(random_cells()).subdivide(random_cells(), 0.2)
     grid.update_max_weight(torch.tensor([3, 5, 3]), torch.tensor([0.5, 0.25, 0.75]))
     again = BrickGrid.from_state(grid.state_dict())
     for name, value in (*grid.state_dict().items(), ("table", grid.table), ("neighbors", grid.neighbors)):

@@ -32,7 +32,7 @@ def shell(size: int = 40) -> BrickGrid:
     middle = torch.arange(size) + 0.5 - size / 2
     radius = torch.stack(torch.meshgrid(middle, middle, middle, indexing="ij")).norm(dim=0)
     holes = torch.from_numpy(np.random.default_rng(1).random((size,) * 3) < 0.1)
-    return BrickGrid(torch.zeros(3), 1.0, (radius < size / 2.2) & (radius > size / 4) & ~holes)
+    return BrickGrid.from_cells(torch.zeros(3), 1.0, (radius < size / 2.2) & (radius > size / 4) & ~holes)
 
 
 def crossing_spans(count: int = 300, size: int = 40) -> RaySpans:
@@ -197,21 +197,29 @@ def test_a_step_of_adam_moves_the_rows_of_the_gradient_alone(ops: ModuleType) ->
         expected = values.double().clone()
 
 
+@pytest.mark.parametrize("ratio", [0.3, 0.5, 0.8])
 @pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
-def test_finer_corners_have_the_values_around_them(ops: ModuleType) -> None:
-    """A linear field, sampled at the corners, is the same field at the corners of half the size."""
+def test_finer_corners_have_the_values_around_them(ops: ModuleType, ratio: float) -> None:
+    """A linear field, sampled at the corners, is the same field at corners of smaller cells inside of the larger ones;
+    those beyond have a mean of what is around them."""
     grid = shell()
-    in_brick = torch.cartesian_prod(*[torch.arange(4)] * 3)
+    in_brick, occupied = torch.cartesian_prod(*[torch.arange(4)] * 3), grid.to_cells(grid.occupied.reshape(-1))
 
-    def field(of: BrickGrid) -> torch.Tensor:
-        position = (4 * of.bricks[:, None] + in_brick).reshape(-1, 3) * float(of.cell_size)
-        return torch.cat((position @ random_tensor(3, 1), position.float()), dim=1)
+    def positions(of: BrickGrid) -> torch.Tensor:
+        return (4 * of.bricks[:, None] + in_brick).reshape(-1, 3) * of.cell_size
 
-    finer = grid.subdivide(grid.to_cells(grid.occupied.reshape(-1)))
-    found = ops.resample(finer.bricks, grid.numbers, field(grid).float())
+    slope = random_tensor(3, 1).double()
+    finer = grid.subdivide(occupied, ratio)
+    values = torch.cat((positions(grid) @ slope, positions(grid)), dim=1).float()
+    found = ops.resample(finer.bricks, ratio, grid.numbers, values)
     brick, cell = torch.nonzero(finer.occupied, as_tuple=True)
     rows = finer.corner_rows(brick, cell).unique()
-    torch.testing.assert_close(found[rows], field(finer).float()[rows], rtol=1e-5, atol=1e-5)
+    position = positions(finer)[rows]
+    inside = occupied[tuple(position.long().clamp(max=len(occupied) - 1).T)]
+    assert inside.sum() > 1000
+    expected = torch.cat((position @ slope, position), dim=1).float()
+    torch.testing.assert_close(found[rows[inside]], expected[inside], rtol=1e-5, atol=1e-5)
+    assert ((found[rows, 1:] - position).abs() <= 1).all()
 
 
 COMPILED = """

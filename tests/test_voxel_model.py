@@ -45,11 +45,12 @@ def steps_of(trainer: Trainer, count: int, first: int = 0) -> list[float]:
 def full_model(cells: torch.Tensor | None = None, max_level: int = 2) -> VoxelModel:
     """In float32, in a box of two units around the origin."""
     cells = torch.ones((8, 8, 8), dtype=torch.bool) if cells is None else cells
-    grid = BrickGrid(torch.full((3,), -1.0), 0.25, cells, max_level)
-    return VoxelModel(VoxelModelConfig(size="tiny"), np.random.default_rng(0), grid)
+    grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, cells, max_level)
+    return VoxelModel(VoxelModelConfig(size="tiny", max_memory=1.0), np.random.default_rng(0), grid)
 
 
-def test_training_learns_the_ball_in_ever_smaller_cells() -> None:
+def test_training_learns_the_ball_in_ever_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(voxels, "ROWS_PER_SEEN", 100)  # few rays are trained on
     trainer = tiny_trainer(config_of(300), VIEWS)
     model = trainer.pipeline.model
     sizes, losses = [], []
@@ -57,27 +58,50 @@ def test_training_learns_the_ball_in_ever_smaller_cells() -> None:
         losses.append(trainer.train_iteration(step))
         sizes.append(float(model.grid.cell_size))
     assert [sizes.count(size) for size in sorted(set(sizes), reverse=True)] == [81, 99, 120]  # 0.27, 0.33, 0.4 of all
-    assert sizes[0] == pytest.approx(4 * sizes[-1])
+    assert sizes[0] == pytest.approx(2 * sizes[100])
+    assert 2.5 * sizes[-1] < sizes[0] <= 8 * sizes[-1]
     assert np.mean(losses[-20:]) < 0.1 * np.mean(losses[:20])
 
 
+def show_all(model: VoxelModel, times: int = 1) -> None:
+    """As if each cell had been seen that often at full weight."""
+    model.grid.max_weight.fill_(1)
+    model.grid.num_seen.fill_(times * model.grid.num_rows)
+
+
 def test_cells_without_weight_are_left_out_when_cells_are_subdivided() -> None:
-    """All but those of one corner of the box, and what is around them."""
+    """All but those of one corner of the box, and the smaller ones next to them."""
     model = full_model()
-    model.grid.update_max_weight(torch.arange(512) % model.grid.num_rows, torch.zeros(512))
+    show_all(model, 100)
     seen = torch.zeros((8, 8, 8), dtype=torch.bool)
     seen[:2, :3, :2] = True
     rows = torch.nonzero(model.grid.occupied.reshape(-1))[:, 0]
     in_corner = torch.stack([model.grid.to_cells(torch.arange(model.grid.num_rows) == row)[seen].any() for row in rows])
-    model.grid.update_max_weight(rows, in_corner.float())
+    model.grid.max_weight.zero_()[rows] = in_corner.float()
     model.update_cells(0.26, 0.28)
     grid = model.grid
     assert int(grid.level) == 1
     expected = torch.zeros((16, 16, 16), dtype=torch.bool)
-    expected[:6, :8, :6] = True
+    expected[:5, :7, :5] = True
     assert torch.equal(grid.to_cells(grid.occupied.reshape(-1)), expected)
     assert model.density.shape == (grid.num_rows, 1)
     assert model.features.shape == (grid.num_rows, 16)
+
+
+@pytest.mark.parametrize(("max_level", "smallest"), [(1, 0.25), (2, 0.5)])
+def test_cells_are_halved_and_become_at_last_as_small_as_what_was_seen_allows(max_level: int, smallest: float) -> None:
+    sizes = []
+    for times in (1, 100, 10_000):
+        model = full_model(max_level=max_level)
+        allowed = voxels.ROWS_PER_SEEN * times * model.grid.num_rows
+        show_all(model, times)
+        model.update_cells(0.5, 0.6)
+        sizes.append(float(model.grid.cell_size) / 0.25)
+        assert int(model.grid.level) == 1
+        assert sizes[-1] in (0.5, smallest) or model.grid.num_rows == pytest.approx(allowed, rel=0.3)
+    assert sizes[0] == 0.5
+    assert sizes[-1] == smallest
+    assert smallest == 0.5 or smallest < sizes[1] < 0.5
 
 
 def test_subdividing_changes_little_of_what_is_rendered() -> None:
@@ -88,9 +112,9 @@ def test_subdividing_changes_little_of_what_is_rendered() -> None:
         model.features.mul_(100)
     rays = tiny_rays(200, dtype=torch.float32)
     before = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
-    model.grid.update_max_weight(torch.arange(512), torch.ones(512))
-    model.grid.max_weight.fill_(1)
+    show_all(model)
     model.update_cells(0.59, 0.61)
+    assert float(model.grid.cell_size) == 0.25 / 2
     assert int(model.grid.level) == 1
     after = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
     assert float(before["accumulation_fine"].max()) > 0.9
@@ -158,14 +182,17 @@ def test_a_grid_that_would_be_empty_is_an_error() -> None:
         model.update_cells(0.26, 0.3)
 
 
-def test_cells_are_subdivided_only_as_far_as_memory_allows() -> None:
+def test_cells_are_subdivided_only_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second time they would be too many."""
+    monkeypatch.setattr(voxels, "ROWS_PER_SEEN", 100)
     rows = 16 * 2**10 * voxels.BYTES_PER_ROW / 2**30  # more than 8^3 cells and their corners take, less than 32^3
     trainer = tiny_trainer(config_of(60, max_memory=rows), VIEWS)
-    steps_of(trainer, 60)
     model = trainer.pipeline.model
-    assert 0 < int(model.grid.level) < 2
-    assert int(model.grid.max_level) == int(model.grid.level)
-    assert model.grid.num_rows * voxels.BYTES_PER_ROW <= rows * 2**30
+    begin = float(model.grid.cell_size)
+    steps_of(trainer, 60)
+    assert int(model.grid.level) == 2
+    assert begin / 4 < float(model.grid.cell_size) < begin
+    assert model.grid.num_rows * voxels.BYTES_PER_ROW <= 1.2 * rows * 2**30
     state = model.state_dict()
     loaded = VoxelModel(model.config, np.random.default_rng(1), saved_grid(state))  # pyright: ignore
     load_weights(loaded, state)

@@ -46,12 +46,13 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
 
 def _describe_levels(views: Views, config: LeanModelConfig, footprint: float) -> str:
     """The cells of voxel-nerf for the same depths."""
-    model = VoxelModelConfig(near=config.near, far=config.far)
+    model = decide_size(VoxelModelConfig(near=config.near, far=config.far), views.images)
     analysis = analyze_views(views, model)
     size, count = analysis.hull.cell_size, int(analysis.hull.cells.sum())
     return (
         f"begins with {count:,} cells of {size:.4f}, {size / footprint:.1f} pixels; what it sees is subdivided "
-        f"{analysis.max_level} times, to {model.voxel_size_px:g} pixels, in at most {model.max_memory:g} GiB"
+        f"{analysis.max_level} times, to {model.voxel_size_px / 2:g} pixels or more, in at most "
+        f"{model.max_memory:.1f} GiB"
     )
 
 

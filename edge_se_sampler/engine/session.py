@@ -36,9 +36,10 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: Grid | No
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else to_pictures(held_out)[0]
     config = resolve_config(config, views)
-    disable_malloc_trimming()
     if isinstance(config.pipeline.model, VoxelModelConfig):
         compile_ops(device)
+    else:
+        disable_malloc_trimming()
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
     run = run or RunFolder.create(config)
@@ -147,7 +148,7 @@ def describe_run(trainer: Trainer) -> str:
         grid = trainer.pipeline.model.grid
         lines.append(
             f"cells    {int(grid.occupied.sum()):,} of {float(grid.cell_size):.4f} a side, to be subdivided "
-            f"{int(grid.max_level - grid.level)} times in at most {model.max_memory:g} GiB"
+            f"{int(grid.max_level - grid.level)} times in at most {model.max_memory:.1f} GiB"
         )
     if isinstance(sampler, SamplingSettings):
         until = "until the object is learned"

@@ -170,7 +170,10 @@ class Trainer:
         """Write a checkpoint of the steps done so far; FloatingPointError, and no file, if a weight is not finite."""
         step = self.next_step - 1
         ended = self.next_step == self.plan.num_steps
-        if not all(torch.isfinite(weight).all() for weight in self.pipeline.model.parameters()):
+        extremes = [
+            torch.stack(torch.aminmax(weight)) for weight in self.pipeline.model.parameters()
+        ]  # needs no memory
+        if not torch.cat(extremes).isfinite().all():
             raise FloatingPointError(f"a weight is not finite after step {step}; try a lower --optimizer.lr")
         state = {
             "step": step,

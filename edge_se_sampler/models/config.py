@@ -12,6 +12,8 @@ from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.protocol import InstantiateConfig
 
 INFINITY = float("inf")
+GIB_PER_PIXEL = 1 / 400
+"""Memory of the voxel model's cells, by the longest side of the images."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,9 @@ class VoxelModelConfig(ModelConfig):
     _target: ClassVar[type | str] = "edge_se_sampler.models.voxels:VoxelModel"
     presets: ClassVar[Mapping[str, SizePreset]] = VOXEL_PRESETS
 
+    voxel_size_px: float = 1.0
+    """About the size of the finest cells, in footprints of a pixel at the center of the scene; as memory and what was
+    seen of the scene allow, half as large to twice as large."""
     cull_by_alpha: bool = True
     """Leave out what lies outside the visual hull of the alpha masks."""
     step_size_voxels: float = 1.0
@@ -221,19 +226,20 @@ class VoxelModelConfig(ModelConfig):
     """Samples that count less in their ray's color are not asked for one."""
     transmittance_threshold: float = 0.006
     """A ray ends where less of its light passes."""
-    prune_weight: float = 0.02
+    prune_weight: float = 0.04
     """Cells that never counted more in a ray's color are pruned."""
     density_lr_scale: float = 30.0
     """Learning rate of the density, as a multiple of the network's."""
     feature_lr_scale: float = 20.0
     """Learning rate of the features, as a multiple of the network's."""
-    total_variation: float = 3e-5
+    total_variation: float = 1e-5
     """How much, beside a ray's squared error, squared differences between features of neighboring corners count."""
     alpha_loss: float = 0.3
     """How much, beside a ray's squared error, that of its opacity against alpha counts: else what has the background's
     color may float in front of it."""
-    max_memory: float = 2.5
-    """GiB that density and features may take in training; cells are subdivided only as far as that allows."""
+    max_memory: float | None = None
+    """GiB that density and features may take in training: the finest cells become as small as that allows. Left out:
+    1 for images of 400 pixels, in proportion to their longest side."""
 
     @property
     def culls_by_alpha(self) -> bool:
@@ -253,7 +259,9 @@ class VoxelModelConfig(ModelConfig):
         for name in ("total_variation", "alpha_loss"):
             value = getattr(self, name)
             check_value(prefix + name.replace("_", "-"), value, 0 <= value < INFINITY, "at least 0")
-        for name in ("density_lr_scale", "feature_lr_scale", "max_memory"):
+        memory = self.max_memory
+        check_value(f"{prefix}max-memory", memory, memory is None or 0 < memory < INFINITY, "above 0")
+        for name in ("density_lr_scale", "feature_lr_scale"):
             value = getattr(self, name)
             check_value(prefix + name.replace("_", "-"), value, 0 < value < INFINITY, "above 0")
 
@@ -295,10 +303,13 @@ Model = TypeVar("Model", bound=ModelConfig)
 
 
 def decide_size(config: Model, images: Iterable[np.ndarray]) -> Model:
-    """The config with size "auto" replaced by what suits the longest side of the images (H, W, 3|4)."""
+    """The config with what is left to the images (H, W, 3|4), size "auto" and the voxel model's memory, replaced by what
+    suits their longest side."""
+    longest = max(max(image.shape[:2]) for image in images)
+    if isinstance(config, VoxelModelConfig) and config.max_memory is None:
+        config = replace(config, max_memory=round(GIB_PER_PIXEL * longest, 3))
     if config.size != "auto":
         return config
-    longest = max(max(image.shape[:2]) for image in images)
     return replace(config, size="tiny" if longest <= 128 else "small" if longest <= 256 else "paper")
 
 

@@ -214,23 +214,28 @@ def composite(tau: Tensor, color: Tensor, samples: Samples, num_rays: int) -> tu
     return rgb, -torch.expm1(-total)[:, None].to(tau.dtype), weight.detach()
 
 
-def resample(bricks: Tensor, parents: Tensor, values: Tensor) -> Tensor:
-    """Values (64 K, F) at the corners of cells, of those at the corners of cells twice as large that surround them.
+def resample(bricks: Tensor, ratio: float, parents: Tensor, values: Tensor) -> Tensor:
+    """Values (64 K, F) at the corners of cells, interpolated between the corners of larger cells, as far as these are
+    stored.
 
     Args:
         bricks: (K, 3) int64: positions of the bricks, in bricks.
+        ratio: size of the cells, as a part of that of the larger ones.
         parents: `BrickGrid.numbers` of the larger cells.
         values: (64 K', F) at the corners of the larger cells.
     """
     cells = torch.cartesian_prod(*[torch.arange(BRICK, device=bricks.device)] * 3)
+    strides = torch.tensor([BRICK * BRICK, BRICK, 1], device=bricks.device)
     chunks = []
     for some in bricks.split(2**13):
-        corner = (BRICK * some[:, None] + cells).reshape(-1, 1, 3)
-        around = (corner + OFFSETS.to(bricks.device)) // 2  # each of them as often as it counts
+        position = (BRICK * some[:, None] + cells).reshape(-1, 3) * ratio
+        cell = position.long()
+        share = corner_weights(position - cell)
+        around = cell[:, None] + OFFSETS.to(bricks.device)
         parent = parents[tuple((around // BRICK).unbind(dim=2))].long()
-        row = (around % BRICK * torch.tensor([BRICK * BRICK, BRICK, 1], device=bricks.device)).sum(dim=2) + 64 * parent
-        share = (parent >= 0).to(values.dtype)
-        share = share / share.sum(dim=1, keepdim=True).clamp(min=1)
+        row = 64 * parent + (around % BRICK * strides).sum(dim=2)
+        share = (share * (parent >= 0)).to(values.dtype)
+        share = share / share.sum(dim=1, keepdim=True).clamp(min=1e-6)
         chunks.append((values[row.clamp(min=0)] * share[:, :, None]).sum(dim=1))
     return torch.cat(chunks)
 

@@ -27,7 +27,7 @@ from edge_se_sampler.models import voxel_ops
 from edge_se_sampler.models.config import VoxelModelConfig
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
-from edge_se_sampler.occupancy.bricks import BrickGrid, dilate
+from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
 FEATURE_DIM, WIDTH = 16, 64
@@ -42,6 +42,11 @@ STEPS_PER_SAMPLED = 50
 """Steps after which cells that have become transparent are found again."""
 TRANSPARENT_MARGIN = 0.7
 """How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
+ROWS_PER_SEEN = 0.25
+"""Rows that there may be, once cells are smaller than was planned, for each weight that was seen before: what is hardly
+seen is not learned any better in smaller cells."""
+MAX_RATIO = 0.8
+"""Cells that would be larger than this part of the present ones are not worth subdividing."""
 BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
 """Density, features, the running means of their gradients and those of squares, and what the grid keeps of a row."""
 
@@ -70,7 +75,8 @@ def compile_ops(device: str) -> None:
     ops, began = device == "cpu" and compiled_ops(), time.monotonic()
     if not ops:
         return
-    grid, cells = BrickGrid(torch.zeros(3), 1.0, torch.ones((1, 1, 1), dtype=torch.bool), 1), torch.ones(1, 1, 1)
+    cells = torch.ones((1, 1, 1), dtype=torch.bool)
+    grid = BrickGrid.from_cells(torch.zeros(3), 1.0, cells, max_level=1)
     model = VoxelModel(VoxelModelConfig(size="tiny", near=0.0), np.random.default_rng(0), grid)
     norm = {"directions_norm": torch.ones(1, 1)}
     ray = RayBundle(torch.full((1, 3), 0.1), torch.full((1, 3), 3**-0.5), torch.zeros((1, 1), dtype=torch.int64), norm)
@@ -80,7 +86,7 @@ def compile_ops(device: str) -> None:
         rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
         ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
         ops.find_dense_cells(grid, weight.data, 0.0)
-        ops.resample(grid.subdivide(cells.bool()).bricks, grid.numbers, weight.data)
+        ops.resample(grid.subdivide(cells, 0.5).bricks, 0.5, grid.numbers, weight.data)
     if time.monotonic() - began > 5:
         print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)
 
@@ -229,14 +235,35 @@ class VoxelModel(RayModel):
         return self.grid.to_cells(seen)
 
     def _subdivide(self) -> None:
-        """Subdivide the cells that were seen, and those around them, unless that would take too much memory."""
-        occupied = self.grid.to_cells(self.grid.occupied.reshape(-1))
-        finer = self.grid.subdivide(dilate(self._find_seen()) & occupied)
-        if finer.num_rows * BYTES_PER_ROW > self.config.max_memory * 2**30:
-            self.grid.max_level.copy_(self.grid.level)
+        """Subdivide the cells that were seen, and those around them, as far as memory and what was seen allow."""
+        grid = self.grid
+        finer = self._find_finer(self._find_seen())
+        if finer is None:
+            grid.level += 1
+            grid.reset_max_weight()
             return
+        ratio = float(finer.cell_size / grid.cell_size)
         for parameter in (self.density, self.features):
             parameter.grad = None
-            parameter.data = choose_ops(self.density).resample(finer.bricks, self.grid.numbers, parameter.data)
+            parameter.data = choose_ops(self.density).resample(finer.bricks, ratio, grid.numbers, parameter.data)
         self.grid = finer
         self.update_sampled()
+
+    def _find_finer(self, kept: Tensor) -> BrickGrid | None:
+        """Those of the grid's cells that are kept, halved; at last smaller, if enough was seen for more rows; larger,
+        if memory is too little. None: it is too little even for cells that are worth subdividing."""
+        grid, ratio = self.grid, 0.5
+        assert self.config.max_memory is not None  # the config is resolved
+        finer = grid.subdivide(kept, float(grid.cell_size) / 2)
+        last = grid.level + 1 == grid.max_level
+        learnable = max(finer.num_rows, ROWS_PER_SEEN * int(grid.num_seen) if last else 0)
+        wanted = min(learnable, self.config.max_memory * 2**30 / BYTES_PER_ROW)
+        for _ in range(4):
+            better = max(ratio * (finer.num_rows / wanted) ** 0.4, 0.25)  # surfaces are layers of some cells
+            if better > MAX_RATIO:
+                return None
+            if 0.95 < better / ratio < 1.05:
+                break
+            ratio = better
+            finer = grid.subdivide(kept, ratio * float(grid.cell_size))
+        return finer

@@ -9,7 +9,8 @@ row    of a cell, and of the values at its least corner: 64 * brick + 16 x + 4 y
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -31,7 +32,9 @@ class BrickGrid(nn.Module):
     Args:
         aabb_min: (3,) float64, world units: the box's least coordinates.
         cell_size: h.
-        cells: (X, Y, Z) bool: cells that are occupied.
+        size: cells along each axis of the box.
+        bricks: (k, 3) int64: positions of the bricks that hold occupied cells, in bricks.
+        occupied: (k, 64) bool: which of their cells are.
         max_level: how often the cells may be subdivided.
     """
 
@@ -48,7 +51,7 @@ class BrickGrid(nn.Module):
     num_seen: Tensor
     """() int64: how many weights that were."""
     finest_size: Tensor
-    """() float64: h at max_level, as it was planned."""
+    """() float64: h at max_level, were cells always halved."""
     level: Tensor
     """() int64: how often the cells have been subdivided, 0 .. max_level."""
     max_level: Tensor
@@ -66,32 +69,41 @@ class BrickGrid(nn.Module):
     """(K,) int64: bit i is set if the brick's cell i is sampled: all occupied cells, or those of them that are not
     transparent."""
 
-    def __init__(self, aabb_min: Tensor, cell_size: float, cells: Tensor, max_level: int = 0) -> None:
+    def __init__(
+        self, aabb_min: Tensor, cell_size: float, size: Sequence[int], bricks: Tensor, occupied: Tensor, max_level: int
+    ) -> None:
         super().__init__()
-        content = cells.numpy().tobytes() + aabb_min.double().numpy().tobytes() + str((cell_size, max_level)).encode()
-        self.register_buffer("scene", torch.tensor(list(hashlib.sha256(content).digest()), dtype=torch.uint8))
+        content = [values.cpu().numpy().tobytes() for values in (aabb_min.double(), bricks, occupied)]
+        digest = hashlib.sha256(b"".join(content) + str((cell_size, *size, max_level)).encode()).digest()
+        self.register_buffer("scene", torch.tensor(list(digest), dtype=torch.uint8))
         self.register_buffer("level", torch.tensor(0))
         self.register_buffer("max_level", torch.tensor(max_level))
         self.register_buffer("finest_size", torch.tensor(cell_size / 2**max_level, dtype=torch.float64))
         self.register_buffer("num_seen", torch.tensor(0))
         self.register_buffer("aabb_min", aabb_min.double())
         self.register_buffer("cell_size", torch.tensor(cell_size, dtype=torch.float64))
-        self.register_buffer("size", torch.tensor(cells.shape))
-        # a brick more at the upper end: for the corners of the last cells
-        cells = F.pad(cells, [pad for size in reversed(cells.shape) for pad in (0, BRICK - size % BRICK)])
-        corners = cells
-        for axis in range(3):
-            corners = corners | corners.roll(1, axis)
-        self.register_buffer("bricks", torch.nonzero(_to_bricks(corners).flatten(3).any(dim=3)).contiguous())
-        self.register_buffer("occupied", _to_bricks(cells).flatten(3)[tuple(self.bricks.T)])
-        self.register_buffer("max_weight", torch.zeros(self.occupied.numel()))
+        self.register_buffer("size", torch.tensor(size))
+        self.register_buffer("bricks", self._bricks_of_corners(bricks, occupied))
         self._index_bricks()
-        self.set_sampled(pack_bits(self.occupied))
+        stored = torch.zeros((len(self.bricks), BRICK**3), dtype=torch.bool, device=bricks.device)
+        stored[self.numbers[tuple(bricks.T)].long()] = occupied
+        self.register_buffer("occupied", stored)
+        self.register_buffer("max_weight", torch.zeros(stored.numel(), device=bricks.device))
+        self.set_sampled(pack_bits(stored))
+
+    @classmethod
+    def from_cells(cls, aabb_min: Tensor, cell_size: float, cells: Tensor, max_level: int = 0) -> BrickGrid:
+        """A box's cells (X, Y, Z) bool, of which those are occupied."""
+        padded = F.pad(cells, [pad for size in reversed(cells.shape) for pad in (0, -size % BRICK)])
+        x, y, z = (size // BRICK for size in padded.shape)
+        blocks = padded.reshape(x, BRICK, y, BRICK, z, BRICK).permute(0, 2, 4, 1, 3, 5).flatten(3)
+        bricks = torch.nonzero(blocks.any(dim=3))
+        return cls(aabb_min, cell_size, cells.shape, bricks, blocks[tuple(bricks.T)], max_level)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor]) -> BrickGrid:
         """The grid whose `state_dict` that is."""
-        grid = cls(state["aabb_min"], 1.0, torch.zeros((1, 1, 1), dtype=torch.bool))
+        grid = cls.from_cells(state["aabb_min"], 1.0, torch.zeros((1, 1, 1), dtype=torch.bool))
         for name in grid.state_dict():
             setattr(grid, name, state[name].clone(memory_format=torch.contiguous_format))
         grid._index_bricks()
@@ -110,6 +122,15 @@ class BrickGrid(nn.Module):
     def shape(self) -> list[int]:
         """Bricks along each axis of the box."""
         return [size // BRICK + 1 for size in self.size.tolist()]
+
+    def _bricks_of_corners(self, bricks: Tensor, occupied: Tensor) -> Tensor:
+        """(K, 3) positions of bricks in which a corner of an occupied cell lies, ascending."""
+        found = torch.zeros(self.shape, dtype=torch.bool, device=bricks.device)
+        cells = occupied.reshape(-1, BRICK, BRICK, BRICK)
+        for upper in OFFSETS.to(bricks.device):
+            x, y, z = (slice(-1, None) if at_end else slice(None) for at_end in upper.tolist())
+            found[tuple((bricks[cells[:, x, y, z].flatten(1).any(dim=1)] + upper).T)] = True
+        return torch.nonzero(found).contiguous()
 
     def _index_bricks(self) -> None:
         """Derive `numbers` and `neighbors`."""
@@ -158,12 +179,48 @@ class BrickGrid(nn.Module):
         brick = torch.gather(self.neighbors[bricks].long(), 1, neighbor)
         return torch.where(brick < 0, -1, 64 * brick + corner)
 
-    def subdivide(self, kept: Tensor) -> BrickGrid:
-        """The same box in cells half as large: the eight parts of those cells (X, Y, Z) bool that are kept."""
-        finer = BrickGrid(self.aabb_min.cpu(), float(self.cell_size) / 2, upsample(kept).cpu()).to(kept.device)
-        finer.level, finer.max_level = self.level + 1, self.max_level
-        finer.finest_size, finer.scene = self.finest_size, self.scene
+    def subdivide(self, kept: Tensor, cell_size: float) -> BrickGrid:
+        """The same box in smaller cells, of at least h / 4. Occupied are those whose center is in an occupied cell, and
+        that are in, or next to one in, cells (X, Y, Z) bool that are kept."""
+        ratio = cell_size / float(self.cell_size)
+        size = torch.ceil(self.size / ratio - 1e-6).long()
+        bricks, occupied = self._find_bricks(kept, ratio, size), []
+        parents = self.to_cells(self.occupied.reshape(-1))
+        window = torch.arange(-1, BRICK + 1, device=kept.device)  # a brick's cells along an axis, and one around
+        for some in bricks.split(2**13):
+            cells = BRICK * some[:, None] + window[:, None]
+            parent = torch.minimum(((cells.clamp(min=0) + 0.5) * ratio).long(), self.size - 1)
+            x, y, z = parent.unbind(dim=2)
+            where = x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]
+            around = kept[where]
+            for axis in (1, 2, 3):
+                lower, middle, upper = (around.narrow(axis, i, BRICK) for i in range(3))
+                around = lower | middle | upper
+            inner = (parents[where] & _in_box(cells, size))[:, 1:-1, 1:-1, 1:-1]
+            occupied.append((around & inner).flatten(1))
+        occupied = torch.cat(occupied)
+        some = occupied.any(dim=1)
+        finer = BrickGrid(
+            self.aabb_min, cell_size, size.tolist(), bricks[some], occupied[some], int(self.max_level)
+        ).to(kept.device)
+        finer.level, finer.finest_size, finer.scene = self.level + 1, self.finest_size, self.scene
         return finer
+
+    def _find_bricks(self, kept: Tensor, ratio: float, size: Tensor) -> Tensor:
+        """(k, 3) positions of the bricks of smaller cells, see `subdivide`, in which some may be occupied."""
+        found = torch.zeros((size // BRICK + 1).tolist(), dtype=torch.bool, device=kept.device)
+        cells = torch.nonzero(kept)
+        first, last = (cells / ratio).long() - 1, ((cells + 1) / ratio).long() + 1  # at most seven, in three bricks
+        ends = [torch.minimum(end.clamp(min=0), size - 1) // BRICK for end in (first, (first + last) // 2, last)]
+        for x, y, z in itertools.product(ends, repeat=3):
+            found[x[:, 0], y[:, 1], z[:, 2]] = True
+        return torch.nonzero(found)
+
+
+def _in_box(cells: Tensor, size: Tensor) -> Tensor:
+    """(k, n, n, n) bool: cells of the coordinates (k, n, 3) along each axis that are not beyond a size (3,)."""
+    x, y, z = (cells < size).unbind(dim=2)
+    return x[:, :, None, None] & y[:, None, :, None] & z[:, None, None, :]
 
 
 def _corner_table() -> Tensor:
@@ -174,12 +231,6 @@ def _corner_table() -> Tensor:
 
 
 CORNERS = _corner_table()
-
-
-def _to_bricks(cells: Tensor) -> Tensor:
-    """(4 BX, 4 BY, 4 BZ) -> (BX, BY, BZ, 4, 4, 4)."""
-    x, y, z = (size // BRICK for size in cells.shape)
-    return cells.reshape(x, BRICK, y, BRICK, z, BRICK).permute(0, 2, 4, 1, 3, 5)
 
 
 def pack_bits(cells: Tensor) -> Tensor:
@@ -199,8 +250,3 @@ def dilate(cells: Tensor) -> Tensor:
         size, padded = cells.shape[axis], F.pad(cells, padding)
         cells = padded.narrow(axis, 0, size) | cells | padded.narrow(axis, 2, size)
     return cells
-
-
-def upsample(cells: Tensor) -> Tensor:
-    """(X, Y, Z) -> (2 X, 2 Y, 2 Z): every cell's value in its eight parts."""
-    return cells.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)

@@ -43,7 +43,8 @@ class SceneAnalysis:
     def brick_grid(self) -> BrickGrid:
         """The same, sparse."""
         hull = self.hull
-        return BrickGrid(torch.from_numpy(hull.aabb_min), hull.cell_size, torch.from_numpy(hull.cells), self.max_level)
+        cells = torch.from_numpy(hull.cells)
+        return BrickGrid.from_cells(torch.from_numpy(hull.aabb_min), hull.cell_size, cells, self.max_level)
 
 
 def analyze_levels(views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool) -> SceneAnalysis:

@@ -165,31 +165,37 @@ def _add_total_variation(values, rows, gradient, weight):
         store(gradient, FEATURES * i, load(gradient, FEATURES * i) + weight * differences)
 
 
-def resample(bricks: Tensor, parents: Tensor, values: Tensor) -> Tensor:
+def resample(bricks: Tensor, ratio: float, parents: Tensor, values: Tensor) -> Tensor:
     """As `voxel_ops.resample`."""
     fine = torch.zeros((64 * len(bricks), values.shape[1]))
-    _resample(*(value.detach().numpy() for value in (bricks, parents, values, fine)))
+    _resample(bricks.numpy(), ratio, parents.numpy(), values.detach().numpy(), fine.numpy())
     return fine
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _resample(bricks, parents, values, fine):
-    """Values (64 K, F) at corners, of those at the corners of cells twice as large that surround them."""
+def _resample(bricks, ratio, parents, values, fine):
     for brick in prange(len(bricks)):
         for cell in range(64):
-            x = 4 * bricks[brick, 0] + (cell >> 4)
-            y = 4 * bricks[brick, 1] + ((cell >> 2) & 3)
-            z = 4 * bricks[brick, 2] + (cell & 3)
-            found = 0
-            row = 64 * brick + cell
-            for i in range(x >> 1, (x + 1 >> 1) + 1):
-                for j in range(y >> 1, (y + 1 >> 1) + 1):
-                    for k in range(z >> 1, (z + 1 >> 1) + 1):
-                        parent = parents[i >> 2, j >> 2, k >> 2]
-                        if parent >= 0:
-                            found += 1
-                            coarse = 64 * parent + ((i & 3) << 4 | (j & 3) << 2 | (k & 3))
-                            for f in range(values.shape[1]):
-                                fine[row, f] += values[coarse, f]
+            x = (4 * bricks[brick, 0] + (cell >> 4)) * ratio
+            y = (4 * bricks[brick, 1] + ((cell >> 2) & 3)) * ratio
+            z = (4 * bricks[brick, 2] + (cell & 3)) * ratio
+            row, total_share = 64 * brick + cell, f32(0)
+            for corner in range(8):
+                dx, dy, dz = corner >> 2, (corner >> 1) & 1, corner & 1
+                share = _share(x, dx) * _share(y, dy) * _share(z, dz)
+                i, j, k = int(x) + dx, int(y) + dy, int(z) + dz
+                parent = parents[i >> 2, j >> 2, k >> 2]
+                if parent >= 0:
+                    total_share += share
+                    coarse = 64 * parent + ((i & 3) << 4 | (j & 3) << 2 | (k & 3))
+                    for f in range(values.shape[1]):
+                        fine[row, f] += share * values[coarse, f]
             for f in range(values.shape[1]):
-                fine[row, f] /= f32(max(found, 1))
+                fine[row, f] /= max(total_share, f32(1e-6))
+
+
+@njit(cache=True, inline="always")
+def _share(position, upper):
+    """Share of the lower or the upper of the two whole numbers around a position."""
+    fraction = position - int(position)
+    return f32(fraction if upper else 1 - fraction)
