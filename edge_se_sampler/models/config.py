@@ -238,8 +238,8 @@ class VoxelModelConfig(ModelConfig):
     """How much, beside a ray's squared error, that of its opacity against alpha counts: else what has the background's
     color may float in front of it."""
     max_memory: float | None = None
-    """GiB that density and features may take in training: the finest cells become as small as that allows. Left out:
-    1 for images of 400 pixels, in proportion to their longest side."""
+    """About how many GiB density and features may take in training: the finest cells become as small as that allows.
+    Left out: 1 for images of 400 pixels, in proportion to their longest side."""
 
     @property
     def culls_by_alpha(self) -> bool:
@@ -303,8 +303,8 @@ Model = TypeVar("Model", bound=ModelConfig)
 
 
 def decide_size(config: Model, images: Iterable[np.ndarray]) -> Model:
-    """The config with what is left to the images (H, W, 3|4), size "auto" and the voxel model's memory, replaced by what
-    suits their longest side."""
+    """The config with what is left to the images (H, W, 3|4), size "auto" and the voxel model's memory, replaced by
+    what suits their longest side."""
     longest = max(max(image.shape[:2]) for image in images)
     if isinstance(config, VoxelModelConfig) and config.max_memory is None:
         config = replace(config, max_memory=round(GIB_PER_PIXEL * longest, 3))

@@ -53,7 +53,7 @@ class BrickGrid(nn.Module):
     finest_size: Tensor
     """() float64: h at max_level, were cells always halved."""
     level: Tensor
-    """() int64: how often the cells have been subdivided, 0 .. max_level."""
+    """() int64: how often the cells have been subdivided, or were found to be small enough, 0 .. max_level."""
     max_level: Tensor
     """() int64."""
     scene: Tensor

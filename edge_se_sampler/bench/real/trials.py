@@ -33,7 +33,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         f"{MODEL}.weight_threshold": 0.002,
         f"{MODEL}.transmittance_threshold": 0.003,
     },
-    "cells of 0.75 pixels": {f"{MODEL}.voxel_size_px": 0.75},
+    "half the memory": {f"{MODEL}.max_memory": 0.5},
 }
 """What is changed, by label."""
 
