@@ -50,6 +50,18 @@ def test_a_budget_shorter_than_its_steps_ends_after_the_first() -> None:
     assert len(plan.segments) == NUM_SEGMENTS
 
 
+def test_segments_as_short_as_a_step_or_two_still_share_the_training_evenly() -> None:
+    plan = Plan(None, time_budget=3.0)
+    plan.decide(0, 0.1)
+    plan.decide(8, 0.8)  # the first steps are slow
+    step, elapsed = 8, 0.8
+    while step != plan.num_steps:
+        assert plan.progress(step) == pytest.approx((elapsed - 0.8) / 2.2, abs=0.06)
+        step, elapsed = step + 1, elapsed + 0.018
+        plan.decide(step, elapsed)
+    assert elapsed == pytest.approx(3, rel=0.03)
+
+
 def test_segments_repeat_a_budget() -> None:
     plan = Plan(None, time_budget=20.0)
     steps, _ = follow(plan, [0.002, 0.01, 0.004])

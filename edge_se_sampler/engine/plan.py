@@ -18,7 +18,7 @@ class Plan:
     def __init__(self, num_steps: int | None, segments: Sequence[int] = (), time_budget: float | None = None) -> None:
         self.segments, self.time_budget = list(segments), time_budget
         self._num_steps = num_steps
-        self._measured_from = 0, 0.0
+        self._measured_from, self._owed = (0, 0.0), 0.0
 
     @property
     def num_steps(self) -> int | None:
@@ -48,15 +48,18 @@ class Plan:
             self.segments.append(FIRST_STEPS)
             return
         seconds_per_step = max(elapsed - since, 1e-9) / (step - begin)
+        seconds = max(0.0, self.time_budget - elapsed) / (NUM_SEGMENTS - len(self.segments))
         while sum(self.segments) == step and len(self.segments) < NUM_SEGMENTS:
-            # a segment that is shorter than a step has none: that part of the training is left out
-            seconds = max(0.0, self.time_budget - elapsed) / (NUM_SEGMENTS - len(self.segments))
-            self.segments.append(int(seconds / seconds_per_step))
+            # of segments that are shorter than a step, only some have one
+            self._owed += seconds / seconds_per_step
+            self.segments.append(int(self._owed))
+            self._owed -= self.segments[-1]
 
     def state_dict(self) -> dict[str, Any]:
         """What was decided, for a checkpoint."""
-        return {"segments": list(self.segments), "measured_from": list(self._measured_from)}
+        return {"segments": list(self.segments), "measured_from": list(self._measured_from), "owed": self._owed}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""
-        self.segments, self._measured_from = list(state["segments"]), tuple(state["measured_from"])
+        self.segments, self._owed = list(state["segments"]), state["owed"]
+        self._measured_from = tuple(state["measured_from"])
