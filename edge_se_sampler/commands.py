@@ -221,9 +221,7 @@ class Inspect:
     far: float = LeanModelConfig.far
     """Depth at which samples end."""
     voxel_size_px: float = LeanModelConfig.voxel_size_px
-    """Side of a grid cell, in widths of a pixel at the object's distance."""
-    step_size_voxels: float = LeanModelConfig.step_size_voxels
-    """Distance between samples, in sides of a grid cell."""
+    """About the size of the finest cells, in widths of a pixel at the center of the scene."""
 
     def run(self) -> None:
         from edge_se_sampler.data.blender import read_blender
@@ -233,9 +231,7 @@ class Inspect:
 
         check_value("downscale", self.downscale, self.downscale >= 1, "at least 1")
         check_output(self.output_path)
-        config = LeanModelConfig(
-            near=self.near, far=self.far, voxel_size_px=self.voxel_size_px, step_size_voxels=self.step_size_voxels
-        )
+        config = LeanModelConfig(near=self.near, far=self.far, voxel_size_px=self.voxel_size_px)
         views = downscale(read_blender(self.data, "train"), self.downscale)
         print(inspect(views, config, self.output_path))
         print(self.output_path)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.engine.config import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
-from edge_se_sampler.models.config import InfoNeRFModelConfig, LeanModelConfig, NeRFModelConfig, VoxelModelConfig
+from edge_se_sampler.models.config import InfoNeRFModelConfig, LeanModelConfig, NeRFModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 ENTRY_POINT_GROUP = "edge_se_sampler.method_configs"
@@ -36,25 +36,17 @@ def _nerf(name: str, model: NeRFModelConfig, early: str, late: str, description:
 
 
 def _lean_nerf() -> MethodSpecification:
-    sampler = EdgeSEPixelSamplerConfig(early="auto", late="uniform", images_per_step="all")
-    manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
-    pipeline, adam = PipelineConfig(manager, LeanModelConfig()), OptimizerConfig(eps=1e-15, fused=True)
-    config = TrainerConfig(method_name="lean-nerf", pipeline=pipeline, optimizer=adam)
-    return MethodSpecification(config, "A small network, evaluated only where the scene is: recommended")
-
-
-def _voxel_nerf() -> MethodSpecification:
     sampler = EdgeSEPixelSamplerConfig(early="auto", late="se", error_source="cached", images_per_step="all")
     manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
     adam = OptimizerConfig(eps=1e-15, beta2=0.99, warmup_steps=20, fused=True)
     config = TrainerConfig(
-        method_name="voxel-nerf",
+        method_name="lean-nerf",
         steps_per_save=20_000,
         steps_per_log=50,
-        pipeline=PipelineConfig(manager, VoxelModelConfig()),
+        pipeline=PipelineConfig(manager, LeanModelConfig()),
         optimizer=adam,
     )
-    return MethodSpecification(config, "Sparse cells, as small as a pixel: for images of 200 pixels and more")
+    return MethodSpecification(config, "Sparse cells as small as a pixel, only where the scene is: recommended")
 
 
 class RegisteredMethod(NamedTuple):
@@ -77,7 +69,6 @@ def registered_methods() -> dict[str, RegisteredMethod]:
         _nerf("info-nerf", InfoNeRFModelConfig(), "uniform", "uniform", info_nerf),
         _nerf("edge-se-info-nerf", InfoNeRFModelConfig(), "edge", "se", "Edge + SE on InfoNeRF"),
         _lean_nerf(),
-        _voxel_nerf(),
     ]
     methods = {method.config.method_name: RegisteredMethod(method, "edge_se_sampler") for method in own_methods}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):

@@ -48,9 +48,9 @@ def train(method: str, scene: Path, output_dir: Path) -> dict[str, Any]:
     torch.set_num_threads(1)
     try:
         config = method_configs()[method]
-        small = {"width": 16, "depth": 2}
-        if method != "lean-nerf":
-            small |= {"num_coarse_samples": 8, "num_importance_samples": 8}
+        small: dict[str, Any] = {"width": 16, "depth": 2, "num_coarse_samples": 8, "num_importance_samples": 8}
+        if method == "lean-nerf":
+            small = {"voxel_size_px": 0.5}
         manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=32)
         model = replace(config.pipeline.model, **small)
         trainer = prepare(

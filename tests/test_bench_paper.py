@@ -29,7 +29,7 @@ from edge_se_sampler.bench.paper.trials import (
 )
 from edge_se_sampler.engine.run_folder import config_from_json, config_to_json
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models.config import FieldModelConfig, InfoNeRFModelConfig
+from edge_se_sampler.models.config import InfoNeRFModelConfig, NeRFModelConfig
 
 SMALL = Settings("tiny", iterations=4, info_iterations=3, rays=16, image_size=16, num_train=11, num_test=1)
 
@@ -51,7 +51,7 @@ def test_a_trial_trains_its_strategy_on_its_method(table: int, few: bool, tmp_pa
     assert config.num_views == (10 if few else None)
     assert config.machine.seed == 5
     assert config.pipeline.datamanager.train_num_rays_per_batch == 64
-    assert isinstance(config.pipeline.model, FieldModelConfig)
+    assert isinstance(config.pipeline.model, NeRFModelConfig)
     assert config.pipeline.model.initialization == "xavier"
 
 

@@ -29,7 +29,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_training_is_measured_on_every_split(scenes: Path, tmp_path: Path) -> None:
-    run = run_trial(Trial("bricks", 1, "2s", "voxel-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
+    run = run_trial(Trial("bricks", 1, "2s", "lean-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
     assert run.keys() == RUN.keys()
     assert run["seconds"] == pytest.approx(2, abs=1)
     assert 12 < run["psnr"] < 40
@@ -44,7 +44,7 @@ def result_of(folder: Path, runs: list[dict[str, Any]]) -> Path:
 
 
 def run_of(
-    psnr: float, seed: int, scene: str = "lego", budget: str = "1m", variant: str = "voxel-nerf"
+    psnr: float, seed: int, scene: str = "lego", budget: str = "1m", variant: str = "lean-nerf"
 ) -> dict[str, Any]:
     return {"scene": scene, "downscale": 2, "budget": budget, "variant": variant, "seed": seed, **RUN, "psnr": psnr}
 
@@ -66,9 +66,9 @@ def test_every_variant_changes_what_there_is() -> None:
     from edge_se_sampler.engine.config import override
     from edge_se_sampler.methods import method_configs
 
-    config = method_configs()["voxel-nerf"]
+    config = method_configs()["lean-nerf"]
     for label, changes in VARIANTS.items():
-        assert (override(config, changes) != config) == (label != "voxel-nerf"), label
+        assert (override(config, changes) != config) == (label != "lean-nerf"), label
 
 
 def test_missing_scenes_are_refused(scenes: Path, tmp_path: Path) -> None:

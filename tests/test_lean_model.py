@@ -1,379 +1,277 @@
-"""The lean model: gradients, cells that come and go, its state, and a training from files to a checkpoint and back."""
+"""The voxel model: how its cells come and go in training, its state, time budgets, and a training from files."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from tiny import cells, check_gradients, occupied_after, tiny_model, tiny_rays
-from torch import Tensor
+from tiny import ball_views, resume_trainer, tiny_rays, tiny_trainer
 
-from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.synthetic.folder import make_scenes
-from edge_se_sampler.engine.config import SAMPLER, TrainerConfig, override
-from edge_se_sampler.engine.inspection import inspect
-from edge_se_sampler.engine.pipeline import analyze_views, load_weights, saved_grid
-from edge_se_sampler.engine.rendering import render_rays, render_view, to_pictures
-from edge_se_sampler.engine.session import describe_run, load_model, prepare, prepare_resume
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
+from edge_se_sampler.engine.optimizers import create_adam
+from edge_se_sampler.engine.pipeline import load_weights, saved_grid
+from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import lean
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.lean import UPDATE_INTERVAL, LeanModel
-from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.hull import Hull, find_hit_pixels
+from edge_se_sampler.models.lean import LeanModel
+from edge_se_sampler.models.ray_model import ParameterGroup
+from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
-RAYS = 12
-FIRST_PRUNING = 2 * UPDATE_INTERVAL
-SIDE = 0.3
+VIEWS = ball_views()
 
 
-def ball(radius: float = 1.0) -> Hull:
-    count = 8
-    at = (np.arange(count) + 0.5 - count / 2) * SIDE
-    inside = np.linalg.norm(np.stack(np.meshgrid(at, at, at, indexing="ij")), axis=0) < radius
-    return Hull(np.full(3, -count * SIDE / 2), SIDE, inside)
-
-
-def model_in(hull: Hull, **changes: Any) -> LeanModel:
-    """A tiny one in float64, its features not all 0."""
-    config = replace(
-        LeanModelConfig(size="tiny", width=8, depth=2, position_frequencies=2, direction_frequencies=1, feature_dim=3),
-        **changes,
-    )
-    model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(hull)).double()
-    assert model.features is not None
-    with torch.no_grad():
-        model.features.table.copy_(torch.from_numpy(np.random.default_rng(1).normal(size=model.features.table.shape)))
-    return model
-
-
-def reloaded(model: LeanModel) -> LeanModel:
-    """Another model from its state."""
-    state = model.state_dict()
-    grid = saved_grid(state)
-    assert isinstance(grid, OccupancyGrid)
-    other = LeanModel(model.config, np.random.default_rng(5), grid).to(model.dtype)
-    load_weights(other, state)
-    return other
-
-
-def pixels() -> Tensor:
-    return torch.from_numpy(np.random.default_rng(2).random((RAYS, 4)))
-
-
-def loss_of(model: LeanModel) -> Tensor:
-    model.begin_step(3, 7)
-    return model.training_loss(tiny_rays(RAYS), {"image": pixels()})[0].sum()
-
-
-def test_gradients_of_everything_against_finite_differences() -> None:
-    model = model_in(ball(), background_color="random").train()
-    check_gradients(model, lambda: loss_of(model))
-
-
-def test_culled_rendering_equals_dense_rendering_of_zeros_outside(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same samples in a box that is wholly occupied, their density set to 0 outside of the ball."""
-    hull = ball()
-    culled = model_in(hull).eval()
-    whole = model_in(Hull(hull.aabb_min, SIDE, np.ones_like(hull.cells))).eval()
-    whole.fine.load_state_dict(culled.fine.state_dict())
-    one, other = culled.features, whole.features
-    assert one is not None
-    assert other is not None
-    with torch.no_grad():
-        shape = cells(whole).occupied.shape
-        number = other.cell_to_row[np.ravel_multi_index(one.cell_origin.long().T.numpy(), shape)]
-        other.table[other.rows[number.long()]] = one.table[one.rows]
-    inside = cells(culled).contains
-    field = whole.fine.forward
-
-    def masked(positions: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
-        raw, color = field(positions, *others)
-        world = positions * cells(whole).half_extent + cells(whole).center
-        return torch.where(inside(world), raw, -torch.inf), color
-
-    monkeypatch.setattr(whole.fine, "forward", masked)
-    rays = tiny_rays(RAYS)
-    # both march from where the same box begins
-    cells(whole).aabb_min.copy_(cells(culled).aabb_min)
-    shown, expected = culled(rays), whole(rays)
-    assert 0.01 < float(shown["accumulation_fine"].detach().mean()) < 0.99
-    for key in ("rgb_fine", "accumulation_fine", "depth_fine"):
-        torch.testing.assert_close(shown[key], expected[key], rtol=0, atol=1e-9)
-
-
-def test_rays_that_miss_the_scene_show_the_background_and_have_no_gradient() -> None:
-    model = model_in(ball(0.3)).train()
-    rays = tiny_rays(RAYS)
-    away = type(rays)(rays.origins, -rays.directions, rays.camera_indices, rays.metadata)
-    error, _ = model.training_loss(away, {"image": pixels()})
-    error.sum().backward()
-    assert bool((model.eval()(away)["rgb_fine"] == 1).all())
-    assert all(weight.grad is None or not weight.grad.any() for weight in model.parameters())
-
-
-# -- cells that come and go
-
-
-def test_empty_cells_are_pruned_and_some_reactivated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean, "DENSITY_BIAS", -20.0)  # nothing anywhere
-    model = model_in(ball()).train()
-    before = int(cells(model).occupied.sum())
-    model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert occupied_after(model, FIRST_PRUNING - UPDATE_INTERVAL) == before  # too early
-    assert occupied_after(model, FIRST_PRUNING + 1) == before  # not the time
-    first = occupied_after(model, FIRST_PRUNING)
-    assert 0 < first < 0.1 * before  # a fiftieth on average
-    again = cells(model).occupied.clone()
-    occupied_after(model, FIRST_PRUNING + UPDATE_INTERVAL)
-    assert not torch.equal(again, cells(model).occupied)  # others
-
-
-def test_densities_of_the_first_interval_do_not_count() -> None:
-    model = model_in(ball()).train()
-    before = int(cells(model).occupied.sum())
-    model.training_loss(tiny_rays(2000), {"image": torch.ones(2000, 3).double()})
-    assert occupied_after(model, UPDATE_INTERVAL) == before
-    assert occupied_after(model, FIRST_PRUNING) < 0.1 * before  # nothing was seen since
-
-
-def test_a_dense_cell_stays() -> None:
-    model = model_in(ball()).train()
-    before = int(cells(model).occupied.sum())
-    for seed in range(3):
-        rays = tiny_rays(2000, seed)
-        model.training_loss(rays, {"image": torch.ones(2000, 3).double()})
-    assert occupied_after(model, FIRST_PRUNING) > 0.95 * before
-
-
-def test_without_features_there_is_the_network_alone() -> None:
-    config = LeanModelConfig(
-        size="tiny", width=8, depth=2, position_frequencies=2, direction_frequencies=1, feature_dim=0
-    )
-    model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(ball()))
-    (group,) = model.parameter_groups()
-    assert group.lr_scale == 1
-    assert len(group.parameters) == len(list(model.fine.parameters())) == len(list(model.parameters()))
-    loss_of(model.double().train()).backward()
-    assert model.fine.layers[0].weight.grad.any()  # pyright: ignore
-
-
-@pytest.mark.parametrize("off", [{"cull_by_density": False}, {"empty_space_skipping": False}])
-def test_without_culling_nothing_is_pruned(off: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean, "DENSITY_BIAS", -20.0)
-    model = model_in(ball(), **off).train()
-    before = int(cells(model).occupied.sum())
-    model.training_loss(tiny_rays(200), {"image": pixels().repeat(17, 1)[:200]})
-    assert not bool(cells(model).max_density.any())
-    assert occupied_after(model, FIRST_PRUNING) == before
-
-
-def test_pruning_is_a_function_of_the_seed() -> None:
-    one, other = (model_in(ball()) for _ in range(2))
-    for model in (one, other):
-        torch.rand(3)  # the global generator is nobody's
-        model.begin_step(FIRST_PRUNING, 11)
-    assert torch.equal(cells(one).occupied, cells(other).occupied)
-
-
-# -- state
-
-
-@pytest.mark.parametrize("count", [6, 40])
-def test_an_uncarved_box_is_transparent_at_first(count: int) -> None:
-    size = 3.0
-    cube = Hull(np.full(3, -size / 2), size / count, np.ones((count, count, count), dtype=bool))
-    config = LeanModelConfig(size="tiny", width=32, depth=1, position_frequencies=4, direction_frequencies=2)
-    model = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(cube))
-    cube.cells[: count // 2] = False  # carved
-    fog = LeanModel(config, np.random.default_rng(0), OccupancyGrid.from_hull(cube))
-    rays = tiny_rays(RAYS, dtype=torch.float32)
-    met = model.eval()(rays)["accumulation_fine"]
-    assert 0.3 < float(met.detach().max()) < 0.9
-    assert float(fog.eval()(rays)["accumulation_fine"].detach().max()) > 0.8
-    assert torch.equal(reloaded(model).eval()(rays)["accumulation_fine"], met)
-
-
-def test_a_state_holds_its_grid() -> None:
-    model = model_in(ball())
-    cells(model).occupied[3] = False
-    fresh = reloaded(model)
-    rays = tiny_rays(RAYS)
-    assert torch.equal(fresh.eval()(rays)["rgb_fine"], model.eval()(rays)["rgb_fine"])
-    assert torch.equal(cells(fresh).occupied, cells(model).occupied)
-
-
-def test_grids_of_other_scenes_are_told_apart() -> None:
-    """As many corners, elsewhere: features would be read at the wrong ones without a word."""
-    model, mirrored = model_in(ball()), ball()
-    one = model_in(replace(mirrored, aabb_min=mirrored.aabb_min + 1e-3))
-    mirrored.cells[0] = False
-    mirrored.cells[0, 4, 4] = True
-    for other in (one, model_in(mirrored)):
-        assert not model.grid.is_of_the_same_scene(other.grid)
-    assert model.grid.is_of_the_same_scene(model_in(ball()).grid)
-
-
-def test_a_run_is_not_resumed_on_a_scene_that_has_changed(larger: Path, tmp_path: Path) -> None:
-    config = replace(lean_config(larger, tmp_path), max_num_iterations=1)
-    trainer = prepare(config)
-    trainer.train()
-    image = next(path for path in sorted(larger.rglob("*.png")) if "train" in str(path))
-    changed_pixels = iio.imread(image)
-    changed_pixels[:12] = 255
-    iio.imwrite(image, changed_pixels)
-    with pytest.raises(InputError, match="cells are not the checkpoint's"):
-        prepare_resume(trainer.run, trainer.config)
-
-
-def test_weights_of_another_model_are_refused() -> None:
-    with pytest.raises(InputError, match="not this model's"):
-        load_weights(model_in(ball(), feature_dim=2), model_in(ball()).state_dict())
-    with pytest.raises(InputError, match="another version"):
-        saved_grid({"grid.corner": torch.zeros(3)})
-
-
-def test_nerf_on_a_grid_that_is_all_occupied_is_the_dense_nerf() -> None:
-    everything, middle = (
-        OccupancyGrid.from_hull(Hull(np.full(3, -half), size, np.ones((count,) * 3, dtype=bool)))
-        for half, size, count in ((9.0, 1.0, 18), (0.3, 0.2, 3))
-    )
-    dense, whole, part = (
-        tiny_model(grid=grid, density_activation="softplus").eval() for grid in (None, everything, middle)
-    )
-    rays = tiny_rays(RAYS)
-    for key, value in dense(rays).items():
-        torch.testing.assert_close(whole(rays)[key], value, rtol=0, atol=1e-12)
-    assert float((part(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).detach().abs().max()) > 1e-3
-
-
-# -- from files
-
-
-@pytest.fixture
-def larger(tmp_path: Path) -> Path:
-    """A scene of enough views and pixels to know where the object is not."""
-    return make_scenes(tmp_path / "synthetic", ["mic"], size=48, num_train=6, num_val=1, num_test=1)[0]
-
-
-def lean_config(scene: Path, output_dir: Path, **model: Any) -> TrainerConfig:
+def config_of(steps: int | None, **changes: Any) -> TrainerConfig:
+    """64 rays a step, in cells of half a pixel at last; for model fields, their names."""
     config: TrainerConfig = method_configs()["lean-nerf"]
-    manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=128)
-    pipeline = replace(config.pipeline, datamanager=manager, model=replace(config.pipeline.model, **model))
-    machine = replace(config.machine, device_type="cpu")
-    return replace(
-        config, data=scene, output_dir=output_dir, max_num_iterations=120, pipeline=pipeline, machine=machine
-    )
+    model = {f"{MODEL}.{name}": value for name, value in {"voxel_size_px": 0.5, **changes}.items()}
+    return override(config, {f"{MANAGER}.train_num_rays_per_batch": 64, "max_num_iterations": steps, **model})
 
 
-def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(larger: Path, tmp_path: Path) -> None:
-    trainer = prepare(lean_config(larger, tmp_path))
+def steps_of(trainer: Trainer, count: int, first: int = 0) -> list[float]:
+    return [trainer.train_iteration(step) for step in range(first, first + count)]
+
+
+def full_model(cells: torch.Tensor | None = None, max_level: int = 2, num_pixels: int = 10**9) -> LeanModel:
+    """In float32, in a box of two units around the origin."""
+    cells = torch.ones((8, 8, 8), dtype=torch.bool) if cells is None else cells
+    grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, cells, max_level, num_pixels)
+    return LeanModel(LeanModelConfig(size="tiny", max_memory=1.0), np.random.default_rng(0), grid)
+
+
+def test_training_learns_the_ball_in_ever_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lean, "ROWS_PER_SEEN", 100)  # few rays are trained on
+    trainer = tiny_trainer(config_of(300), VIEWS)
     model = trainer.pipeline.model
-    views = trainer.pipeline.datamanager
-    assert not bool(views.image_batch["mask"].all())  # only pixels whose rays hit the hull
-    assert views.train_pixel_sampler.strategy == "uniform"
-    trainer.train()
-    picture = to_pictures(read_blender(larger, "test"))[0]
-    _, psnr = render_view(model, picture)
-    away = picture.image[..., 3:] * (1 - picture.image[..., :3])
-    background = -10 * np.log10(np.mean(away.astype(np.float64) ** 2))
-    assert 5 < background < 30
-    assert psnr > background + 3
-    again, _ = load_model(trainer.run, trainer.config)
-    rays = picture.rays(model.device)
-    assert torch.equal(render_rays(again, rays), render_rays(model, rays))
+    sizes, losses = [], []
+    for step in range(300):
+        losses.append(trainer.train_iteration(step))
+        sizes.append(float(model.grid.cell_size))
+    # subdivided after 0.2025 and 0.45 of all
+    assert [sizes.count(size) for size in sorted(set(sizes), reverse=True)] == [61, 74, 165]
+    assert sizes[0] == pytest.approx(2 * sizes[100])
+    assert 2.5 * sizes[-1] < sizes[0] <= 8 * sizes[-1]
+    assert np.mean(losses[-20:]) < 0.1 * np.mean(losses[:20])
 
 
-def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: Path, tmp_path: Path) -> None:
-    trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
-    analysis = analyze_views(read_blender(larger, "train"), trainer.config.pipeline.model)
-    assert (analysis.max_level, analysis.num_silhouettes) == (1, 0)
-    assert cells(trainer.pipeline.model).is_of_the_same_scene(
-        OccupancyGrid.from_hull(analysis.hull, analysis.max_level)
+def show_all(model: LeanModel, times: int = 1) -> None:
+    """As if each cell had been seen that often at full weight."""
+    model.grid.max_weight.fill_(1)
+    model.grid.num_seen.fill_(times * model.grid.num_rows)
+
+
+def test_cells_without_weight_are_left_out_when_cells_are_subdivided() -> None:
+    """All but those of one corner of the box, and the smaller ones next to them."""
+    model = full_model()
+    show_all(model, 100)
+    seen = torch.zeros((8, 8, 8), dtype=torch.bool)
+    seen[:2, :3, :2] = True
+    rows = torch.nonzero(model.grid.occupied.reshape(-1))[:, 0]
+    in_corner = torch.stack([model.grid.to_cells(torch.arange(model.grid.num_rows) == row)[seen].any() for row in rows])
+    model.grid.max_weight.zero_()[rows] = in_corner.float()
+    model.update_cells(0.26, 0.28)
+    grid = model.grid
+    assert int(grid.level) == 1
+    expected = torch.zeros((16, 16, 16), dtype=torch.bool)
+    expected[:5, :7, :5] = True
+    assert torch.equal(grid.to_cells(grid.occupied.reshape(-1)), expected)
+    assert model.density.shape == (grid.num_rows, 1)
+    assert model.features.shape == (grid.num_rows, 16)
+
+
+@pytest.mark.parametrize(("max_level", "smallest"), [(1, 0.25), (2, 0.5)])
+def test_cells_are_halved_and_become_at_last_as_small_as_what_was_seen_allows(max_level: int, smallest: float) -> None:
+    sizes = []
+    for times in (1, 100, 10_000):
+        model = full_model(max_level=max_level)
+        allowed = lean.ROWS_PER_SEEN * times * model.grid.num_rows
+        show_all(model, times)
+        model.update_cells(0.5, 0.6)
+        sizes.append(float(model.grid.cell_size) / 0.25)
+        assert int(model.grid.level) == 1
+        assert sizes[-1] in (0.5, smallest) or model.grid.num_rows == pytest.approx(allowed, rel=0.3)
+    assert sizes[0] == 0.5
+    assert sizes[-1] == smallest
+    assert smallest == 0.5 or smallest < sizes[1] < 0.5
+
+
+@pytest.mark.parametrize("num_pixels", [100, 10_000])
+def test_there_are_no_more_corners_than_pixels_can_tell(num_pixels: int) -> None:
+    """But cells are halved all the same."""
+    model = full_model(max_level=1, num_pixels=num_pixels)
+    show_all(model, 10_000)
+    model.update_cells(0.4, 0.5)
+    if num_pixels == 100:
+        assert float(model.grid.cell_size) == 0.25 / 2
+    else:
+        assert model.grid.num_rows == pytest.approx(lean.ROWS_PER_PIXEL * num_pixels, rel=0.3)
+
+
+def test_subdividing_changes_little_of_what_is_rendered() -> None:
+    """Corners in the middle of edges are interpolated, so values inside are as before; rays take more steps."""
+    model = full_model(max_level=1).eval()
+    with torch.no_grad():
+        model.density.copy_(torch.from_numpy(np.random.default_rng(1).normal(size=model.density.shape)))
+        model.features.mul_(100)
+    rays = tiny_rays(200, dtype=torch.float32)
+    before = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
+    show_all(model)
+    model.update_cells(0.59, 0.61)
+    assert float(model.grid.cell_size) == 0.25 / 2
+    assert int(model.grid.level) == 1
+    after = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
+    assert float(before["accumulation_fine"].max()) > 0.9
+    for key, value in before.items():
+        assert float((after[key] - value).abs().mean()) < 0.02, key
+
+
+def test_cells_are_not_subdivided_before_enough_was_seen() -> None:
+    model = full_model()
+    model.grid.update_max_weight(torch.arange(511), torch.ones(511))  # of 512 cells
+    model.update_cells(0.26, 0.3)
+    assert int(model.grid.level) == 0
+    model.grid.update_max_weight(torch.arange(1), torch.ones(1))
+    model.update_cells(0.3, 0.31)
+    assert int(model.grid.level) == 1
+
+
+def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
+    model = full_model()
+    model.grid.update_max_weight(torch.arange(512), torch.ones(512))
+    model.update_cells(0.07, 0.08)
+    assert model.grid.max_weight.any()
+    model.update_cells(0.08, 0.082)  # 0.4 of 0.2025
+    assert not model.grid.max_weight.any()
+
+
+def test_cells_that_have_become_transparent_are_not_sampled() -> None:
+    model = full_model()
+    with torch.no_grad():
+        model.density.fill_(-20.0)
+        model.density[0] = 0.0
+    assert (unpack_bits(model.grid.sampled) == model.grid.occupied).all()
+    model.update_sampled()
+    sampled = model.grid.to_cells(unpack_bits(model.grid.sampled).reshape(-1))
+    x, y, z = model.grid.bricks[0].tolist()
+    assert torch.nonzero(sampled).tolist() == [[x, y, z]]  # cells on the other sides of that corner are outside
+    assert torch.nonzero(model.grid.table >= 0).tolist() == [[x, y, z]]
+
+
+def test_total_variation_counts_in_every_fourth_step() -> None:
+    """Four times as much: without another gradient, a row moves towards its neighbors then."""
+    values = torch.nn.Parameter(torch.zeros(64, 16))
+    with torch.no_grad():
+        values[0] = 1.0
+    group = ParameterGroup([values], lr_scale=10.0, total_variation=0.1)
+    config = config_of(None, size="tiny")
+    adam = create_adam([group], config.preset, config.optimizer)
+    gradient = torch.sparse_coo_tensor(torch.tensor([[0]]), torch.zeros(1, 16), (64, 16), check_invariants=True)
+    seen = []
+    for _ in range(4):
+        values.grad = gradient.clone()
+        adam.step()
+        seen.append(values[0, 0].item())
+    assert seen[:3] == [1.0] * 3
+    step = 10 * config.preset.learning_rate  # of Adam, whose means are a tenth and a hundredth of the first gradient
+    assert seen[3] == pytest.approx(1 - step, rel=1e-5)
+    weight = 4 * 0.1 / (3 * config.preset.rays)
+    assert float(adam.state[values]["exp_avg"][0, 0]) == pytest.approx(0.1 * 3 * weight, rel=1e-5)  # three neighbors
+
+
+def test_a_grid_that_would_be_empty_is_an_error() -> None:
+    model = full_model()
+    model.grid.update_max_weight(torch.arange(512), torch.full((512,), 0.001))
+    with pytest.raises(FloatingPointError, match=r"no cell has anything.*--optimizer\.lr"):
+        model.update_cells(0.26, 0.3)
+
+
+def test_cells_are_subdivided_only_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second time they would be too many."""
+    monkeypatch.setattr(lean, "ROWS_PER_SEEN", 100)
+    rows = 16 * 2**10 * lean.BYTES_PER_ROW / 2**30  # more than 8^3 cells and their corners take, less than 32^3
+    trainer = tiny_trainer(config_of(60, max_memory=rows), VIEWS)
+    model = trainer.pipeline.model
+    begin = float(model.grid.cell_size)
+    steps_of(trainer, 60)
+    assert int(model.grid.level) == 2
+    assert begin / 4 < float(model.grid.cell_size) < begin
+    assert model.grid.num_rows * lean.BYTES_PER_ROW <= 1.2 * rows * 2**30
+    state = model.state_dict()
+    loaded = LeanModel(model.config, np.random.default_rng(1), saved_grid(state))  # pyright: ignore
+    load_weights(loaded, state)
+    before, after = (
+        render_outputs(of, tiny_rays(50, dtype=torch.float32), ["rgb_fine"])["rgb_fine"] for of in (model, loaded)
     )
-    views = trainer.pipeline.datamanager
-    assert "mask" not in views.image_batch
-    loss = [trainer.train_iteration(step) for step in range(3)]
-    assert all(np.isfinite(loss))
-    sampler = views.train_pixel_sampler
-    assert (sampler.strategy, sampler.schedule.observations) == ("edge", 3)
-    assert "pixels   edge until the object is learned, then uniform" in describe_run(trainer)
+    assert torch.equal(before, after)
 
 
-@pytest.mark.parametrize("by_alpha", [True, False])
-def test_pixels_that_were_chosen_stay_chosen(by_alpha: bool, larger: Path, tmp_path: Path) -> None:
-    config = lean_config(larger, tmp_path, cull_by_alpha=by_alpha)
-    chosen = "edge" if by_alpha else "uniform"
-    sampler = prepare(override(config, {f"{SAMPLER}.early": chosen})).pipeline.datamanager.train_pixel_sampler
-    assert (sampler.strategy, sampler.config.schedule) == (chosen, "fraction")
+@pytest.mark.parametrize("stop", [5, 20, 40])
+def test_a_resumed_training_is_the_same_bit_for_bit_at_every_level(
+    stop: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lean, "STEPS_PER_SAMPLED", 7)
+    whole = tiny_trainer(config_of(50), VIEWS)
+    expected = steps_of(whole, 50)
+    assert int(whole.pipeline.model.grid.level) == 2
+    first = tiny_trainer(config_of(50), VIEWS, tmp_path)
+    steps_of(first, stop)
+    first.next_step = stop
+    first.save()
+    second = resume_trainer(first, VIEWS)
+    assert steps_of(second, 50 - stop, stop) == expected[stop:]
+    for name, value in whole.pipeline.model.state_dict().items():
+        assert torch.equal(second.pipeline.model.state_dict()[name], value), name
 
 
-def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_se: Any) -> None:
-    flags = ["train", "lean-nerf", "--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "3"]
-    for flag, value, word in (
-        ("--pipeline.model.voxel-size-px", "0", "voxel-size-px is 0.0"),
-        ("--pipeline.model.step-size-voxels", "nan", "step-size-voxels is nan"),
-        ("--pipeline.model.feature-dim", "-1", "feature-dim is -1"),
-        ("--pipeline.model.feature-dim", "100000", "between 0 and 64"),
-        ("--pipeline.model.step-size-voxels", "1e-6", "at least 0.05"),
-        ("--pipeline.model.voxel-size-px", "1e300", "at most 1000"),
-        ("--reinit-dead", "True", "cannot die"),
-        ("--pipeline.datamanager.pixel-sampler.error-source", "coarse", "no coarse network"),
-    ):
-        answer = edge_se(*flags, flag, value)
-        assert answer.code == 2, (flag, answer)
-        assert word in answer.err
-        assert answer.err.count("\n") == 1
-    flags[1] = "edge-nerf"
-    answer = edge_se(*flags, "--pipeline.datamanager.skip-empty-rays", "True")
-    assert answer.code == 2
-    assert "add --pipeline.model.empty-space-skipping True" in answer.err
-    assert not (tmp_path / "out").exists()
+def test_without_masks_it_begins_with_a_thin_fog_in_all_of_the_box() -> None:
+    opaque = ball_views()
+    opaque = type(opaque)(opaque.names, tuple(image[..., :3].copy() for image in opaque.images), None, opaque.cameras)
+    trainer = tiny_trainer(config_of(50), opaque)
+    model = trainer.pipeline.model
+    through = render_outputs(model, tiny_rays(100, dtype=torch.float32), ["accumulation_fine"])["accumulation_fine"]
+    assert 0.3 < float(through.median()) < 0.8  # 1 - exp(-1) along the box
+    losses = steps_of(trainer, 50)
+    assert losses[-1] < losses[0]
 
 
-def test_from_the_command_line(scene: Path, tmp_path: Path, edge_se: Any) -> None:
-    flags = ["--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "8"]
-    assert edge_se("train", "lean-nerf", *flags).code == 0
-    (run,) = (tmp_path / "out").glob("*/lean-nerf/*")
-    answer = edge_se("eval", run, "--output-path", tmp_path / "eval.json")
-    assert answer.code == 0, answer
-    assert json.loads((tmp_path / "eval.json").read_text())["method_name"] == "lean-nerf"
+@pytest.mark.parametrize("channels", [3, 4])
+def test_opacity_is_held_to_alpha_where_there_is_one(channels: int) -> None:
+    model = full_model()
+    outputs = {"rgb_fine": torch.rand(5, 3), "accumulation_fine": torch.rand(5, 1), "background": torch.ones(5, 3)}
+    batch = {"image": torch.rand(5, channels), "weight": torch.rand(5)}
+    loss, error = model.loss(outputs, batch)
+    expected = error / 3
+    if channels == 4:
+        expected += 0.1 * (outputs["accumulation_fine"][:, 0] - batch["image"][:, 3]) ** 2
+    torch.testing.assert_close(loss, expected * batch["weight"])
 
 
-def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: Any) -> None:
-    answer = edge_se("inspect", "--data", larger, "--output-path", tmp_path / "inspect.png")
-    assert answer.code == 0, answer
-    findings = dict(line.split(maxsplit=1) for line in answer.out.splitlines()[:-1])
-    analysis = analyze_views(read_blender(larger, "train"), LeanModelConfig())
-    assert f"{analysis.hull.cells.sum():,} of" in findings["cells"]
-    assert findings["silhouettes"].startswith("6 of 6 views")
-    assert findings["pixel"].startswith(f"{analysis.box.pixel_footprint:.4f}")
-    hit = find_hit_pixels(read_blender(larger, "train"), analysis.hull)
-    assert findings["rays"].startswith(f"{100 * np.mean(hit):.1f} %")
-    assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
-    assert findings["sampling"].startswith("uniform")
-    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2**5 / analysis.box.pixel_footprint
-    assert wave > 2  # pixels: no more than the cameras resolve
-    assert findings["encoding"].startswith(f"6 frequencies of a position, the finest wave {wave:.1f} pixels long")
-    assert findings["network"] == "1 x 64, 256 rays a step, 12,000 steps: size tiny, by the images' longer side"
-    unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
-    assert "by edges as long as they pay" in unlocated
-    large = analyze_views(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False))
-    for cells_line, finest in ((unlocated, large.hull.cell_size / 2), (findings["cells"], analysis.hull.cell_size)):
-        assert f"training begins with {2 * finest:.4f}, subdivided to {finest:.4f} if dense" in cells_line
-    whole = large.hull.cells
-    assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
-    for flag, value in (
-        ("--near", "7"),
-        ("--voxel-size-px", "0"),
-        ("--step-size-voxels", "inf"),
-        ("--step-size-voxels", "1e-5"),
-    ):
-        assert edge_se("inspect", "--data", larger, flag, value).code == 2
+def test_outputs_in_evaluation_do_not_depend_on_chunks() -> None:
+    model = full_model().eval()
+    with torch.no_grad():
+        model.density.fill_(0.5)
+    rays = tiny_rays(300, dtype=torch.float32)
+    whole = model(rays)
+    assert torch.equal(
+        torch.cat([model(rays[rows])["rgb_fine"] for rows in (slice(0, 100), slice(100, 300))]), whole["rgb_fine"]
+    )
+    middle = -(rays.origins * rays.directions).sum(dim=1, keepdim=True)
+    hit = whole["accumulation_fine"] > 0.99
+    assert hit.any()
+    assert ((whole["depth_fine"] < middle) & (whole["depth_fine"] > middle - 1.8))[hit].all()
+
+
+def test_without_numba_one_line_says_what_it_would_bring(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(lean, "find_spec", lambda name: None)
+    lean.compiled_ops.cache_clear()
+    try:
+        assert steps_of(tiny_trainer(config_of(5), VIEWS), 5)
+        assert capsys.readouterr().err.count("edge-se-sampler[fast]") == 1
+    finally:
+        lean.compiled_ops.cache_clear()

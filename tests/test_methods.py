@@ -17,7 +17,7 @@ def test_the_six_strategies_of_the_paper_and_two_on_its_other_method():
     samplers = {
         name: method.specification.config.pipeline.datamanager.pixel_sampler
         for name, method in registered_methods().items()
-        if method.origin == "edge_se_sampler" and name not in ("lean-nerf", "voxel-nerf")
+        if method.origin == "edge_se_sampler" and name != "lean-nerf"
     }
     table = {
         "vanilla-nerf": ("uniform", "uniform"),

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import check_gradients, tiny_model, tiny_rays, with_constant_density
+from tiny import check_gradients, grid_of, tiny_model, tiny_rays, with_constant_density
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models import nerf
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import target_colors
-from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.hull import Hull
 
 RAYS = 9
@@ -264,10 +264,10 @@ def test_the_fine_error_does_not_pull_at_the_coarse_network() -> None:
 # --- packed rendering ---
 
 
-def ball_grid(radius: float) -> OccupancyGrid:
+def ball_grid(radius: float) -> BrickGrid:
     """Cells whose center lies in a ball around the origin."""
     centers = np.stack(np.meshgrid(*[np.arange(-1.75, 2, 0.5)] * 3, indexing="ij"))
-    return OccupancyGrid.from_hull(Hull(np.full(3, -2.0), 0.5, np.linalg.norm(centers, axis=0) < radius)).double()
+    return grid_of(Hull(np.full(3, -2.0), 0.5, np.linalg.norm(centers, axis=0) < radius))
 
 
 def mask_density(field: nn.Module, occupied: Callable[[Tensor], Tensor]) -> None:
@@ -325,3 +325,17 @@ def test_where_nothing_is_occupied_the_background_stays_and_there_is_no_gradient
     assert bool((outputs["rgb_fine"] == 1).all())
     model.loss(outputs, {"image": pixels()})[0].sum().backward()
     assert all(parameter.grad is None or not parameter.grad.any() for parameter in model.parameters())
+
+
+def test_on_a_grid_that_is_all_occupied_it_is_the_dense_nerf() -> None:
+    everything, middle = (
+        grid_of(Hull(np.full(3, -half), size, np.ones((count,) * 3, dtype=bool)))
+        for half, size, count in ((9.0, 1.0, 18), (0.3, 0.2, 3))
+    )
+    dense, whole, part = (
+        tiny_model(grid=grid, density_activation="softplus").eval() for grid in (None, everything, middle)
+    )
+    rays = tiny_rays(RAYS)
+    for key, value in dense(rays).items():
+        torch.testing.assert_close(whole(rays)[key], value, rtol=0, atol=1e-12)
+    assert float((part(rays)["rgb_fine"] - dense(rays)["rgb_fine"]).detach().abs().max()) > 1e-3

@@ -28,12 +28,10 @@ from edge_se_sampler.engine.config import MachineConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import prepare, prepare_resume
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models import lean
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
 
 command, folder, data, interrupt_at, method = sys.argv[1:]
 folder, data, interrupt_at = Path(folder), Path(data), int(interrupt_at)
-lean.UPDATE_INTERVAL, lean.ALPHA_THRESHOLD, lean.MIN_OPTICAL_DEPTH = 5, 0.001, 0.0
 if command == "resume":
     run = RunFolder(folder)
     trainer = prepare_resume(run, run.config(method_configs()))
@@ -41,10 +39,8 @@ else:
     config = method_configs()[method.split()[0]]
     changes = {"early_fraction": 0.7}
     samples = {"num_coarse_samples": 8, "num_importance_samples": 8, "density_noise": 0.1}
-    if method == "lean-nerf":  # with all that has a state: cells, their features, what was remembered
-        changes, samples = {"early": "edge", "late": "se", "error_source": "cached", "early_fraction": 0.3}, {}
-    if "without alpha" in method:  # where the early phase is decided again, and watched, and cells are split
-        changes, samples = {}, {"cull_by_alpha": False, "voxel_size_px": 0.1 if "twice" in method else 0.4}
+    if method == "lean-nerf without alpha":  # where the early phase is watched
+        changes, samples = {}, {"cull_by_alpha": False}
     sampler = replace(config.pipeline.datamanager.pixel_sampler, **changes)
     manager = replace(config.pipeline.datamanager, train_num_rays_per_batch=24, pixel_sampler=sampler)
     model = replace(config.pipeline.model, **samples)
@@ -105,9 +101,7 @@ def state(run: Path) -> dict[str, bytes | float | str]:
     [
         ("edge-se-nerf", 8),  # in the edge phase
         pytest.param("edge-se-nerf", 16, marks=pytest.mark.slow),  # in the SE phase
-        ("lean-nerf", 12),
-        ("lean-nerf without alpha", 12),
-        pytest.param("lean-nerf without alpha, split twice", 12, marks=pytest.mark.slow),
+        ("lean-nerf without alpha", 12),  # with alpha: test_lean_model
     ],
 )
 def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, interrupt_at: int):

@@ -17,10 +17,10 @@ from tiny import ball_views, tiny_trainer
 
 from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models import voxel_kernels, voxel_ops, voxels
+from edge_se_sampler.models import lean, voxel_kernels, voxel_ops
+from edge_se_sampler.models.lean import ColorNetwork
 from edge_se_sampler.models.voxel_kernels import rendering
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
-from edge_se_sampler.models.voxels import ColorNetwork
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
 MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01)
@@ -224,16 +224,16 @@ def test_finer_corners_have_the_values_around_them(ops: ModuleType, ratio: float
 
 COMPILED = """
 from numba.core.registry import CPUDispatcher
-from edge_se_sampler.models import voxels
+from edge_se_sampler.models import lean
 from edge_se_sampler.models.voxel_kernels import marching, rendering, rows, shading
 
 def signatures():
     functions = [f for m in (marching, rendering, rows, shading) for f in vars(m).values()]
     return {f.py_func.__name__: len(f.signatures) for f in functions if isinstance(f, CPUDispatcher)}
 
-voxels.compile_ops("cpu")
+lean.compile_ops("cpu")
 compiled = signatures()
-from test_voxel_model import config_of, steps_of, VIEWS
+from test_lean_model import config_of, steps_of, VIEWS
 from tiny import tiny_trainer
 steps_of(tiny_trainer(config_of(30), VIEWS), 30)
 assert signatures() == compiled, (compiled, signatures())
@@ -266,8 +266,8 @@ def test_kernels_that_have_just_been_compiled_round_as_those_that_are_loaded(tmp
 
 
 def losses(ops: ModuleType, monkeypatch: pytest.MonkeyPatch, steps: int = 50) -> list[float]:
-    monkeypatch.setattr(voxels, "compiled_ops", lambda: ops)
-    config: TrainerConfig = method_configs()["voxel-nerf"]
+    monkeypatch.setattr(lean, "compiled_ops", lambda: None if ops is voxel_ops else ops)
+    config: TrainerConfig = method_configs()["lean-nerf"]
     changes = {f"{MANAGER}.train_num_rays_per_batch": 64, f"{MODEL}.voxel_size_px": 0.5}
     # a sample at a threshold falls on one side or the other by rounding, and has to matter little
     changes |= {f"{MODEL}.{name}_threshold": 1e-5 for name in ("alpha", "weight", "transmittance")}

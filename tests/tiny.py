@@ -22,8 +22,8 @@ from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
-from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.hull import Hull
 
 SMALL = (
     "--max-num-iterations", "6", "--pipeline.datamanager.train-num-rays-per-batch", "16",
@@ -47,21 +47,14 @@ def tiny_config(**changes: Any) -> NeRFModelConfig:
     return replace(small, **changes)
 
 
-def tiny_model(seed: int = 0, grid: OccupancyGrid | None = None, **changes: Any) -> NeRFModel:
+def tiny_model(seed: int = 0, grid: BrickGrid | None = None, **changes: Any) -> NeRFModel:
     """A NeRF of `tiny_config`, in float64."""
     return NeRFModel(tiny_config(**changes), np.random.default_rng(seed), grid).double()
 
 
-def cells(model: RayModel) -> OccupancyGrid:
-    """The grid of a model that has one."""
-    assert isinstance(model.grid, OccupancyGrid)
-    return model.grid
-
-
-def occupied_after(model: RayModel, step: int) -> int:
-    """How many cells are occupied once a step has begun, which may prune and subdivide them."""
-    model.begin_step(step, step + 1)
-    return int(cells(model).occupied.sum())
+def grid_of(hull: Hull) -> BrickGrid:
+    """A hull's cells."""
+    return BrickGrid.from_cells(torch.from_numpy(hull.aabb_min), hull.cell_size, torch.from_numpy(hull.cells))
 
 
 def tiny_rays(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> RayBundle:

@@ -18,7 +18,6 @@ from edge_se_sampler.models.config import (
     ModelConfig,
     NeRFModelConfig,
     SizePreset,
-    VoxelModelConfig,
 )
 from edge_se_sampler.protocol import InstantiateConfig
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -84,7 +83,7 @@ class TrainerConfig(InstantiateConfig):
     """Planned iterations, which determine phases and learning rate; by default the model size's."""
     time_budget: str | None = None
     """Train for so long (60, 90s, 10m, 1h) in place of a number of iterations: phases and learning rate follow the
-    clock (voxel-nerf)."""
+    clock (lean-nerf)."""
     segments: tuple[int, ...] | None = None
     """Iterations of each hundredth of the training; config.json has those of a run with a time budget, to repeat it."""
     max_seconds: float | None = None
@@ -152,7 +151,7 @@ class TrainerConfig(InstantiateConfig):
         if manager.skip_empty_rays and not model.needs_grid:
             remedy = "add --pipeline.model.empty-space-skipping True"
             raise InputError(f"--pipeline.datamanager.skip-empty-rays has no effect here; {remedy}")
-        if not isinstance(model, LeanModelConfig | VoxelModelConfig):
+        if not isinstance(model, LeanModelConfig):
             return
         if self.reinit_dead:
             raise InputError("--reinit-dead: this model's density is never 0, it cannot die; leave the flag out")
@@ -163,8 +162,8 @@ class TrainerConfig(InstantiateConfig):
     def check_plan(self) -> None:
         """Raise InputError if what is set of the run's length has no meaning."""
         given = self.budget_seconds is not None or self.segments is not None
-        if given and not isinstance(self.pipeline.model, VoxelModelConfig):
-            raise InputError(f"--time-budget and --segments: {self.method_name} cannot follow them; use voxel-nerf")
+        if given and not isinstance(self.pipeline.model, LeanModelConfig):
+            raise InputError(f"--time-budget and --segments: {self.method_name} cannot follow them; use lean-nerf")
         if given and self.max_num_iterations is not None:
             raise InputError("--max-num-iterations and --time-budget or --segments: give one of them")
         sampler = self.pipeline.datamanager.pixel_sampler

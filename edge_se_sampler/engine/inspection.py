@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views
-from edge_se_sampler.models.config import LeanModelConfig, VoxelModelConfig, decide_size
-from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.hull import find_hit_pixels
-from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, pick_pixels
+from edge_se_sampler.models.config import LeanModelConfig, decide_size
+from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis
 from edge_se_sampler.sampling.edges import unit_float
 
 NUM_VIEWS = 3  # in the picture
@@ -26,7 +23,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     config = decide_size(config, views.images)
     config.check()
     analysis = analyze_views(views, config)
-    hull, hit_pixels = analysis.hull, find_hit_pixels(views, analysis.hull)
+    hull, hit_pixels = analysis.hull, analysis.hit_pixels
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
     ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
     for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
@@ -41,54 +38,31 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
         axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")
     figure.tight_layout()
     save_figure(figure, path)
-    return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, hit_pixels, config).items())
+    return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, config).items())
 
 
-def _describe_levels(views: Views, config: LeanModelConfig, footprint: float) -> str:
-    """The cells of voxel-nerf for the same depths."""
-    model = decide_size(VoxelModelConfig(near=config.near, far=config.far), views.images)
-    analysis = analyze_views(views, model)
-    size, count = analysis.hull.cell_size, int(analysis.hull.cells.sum())
-    return (
-        f"begins with {count:,} cells of {size:.4f}, {size / footprint:.1f} pixels; what it sees is subdivided "
-        f"{analysis.max_level} times, to {model.voxel_size_px / 2:g} pixels or more, in at most "
-        f"{model.max_memory:.1f} GiB"
-    )
-
-
-def _findings(
-    views: Views, analysis: SceneAnalysis, hit_pixels: list[np.ndarray], config: LeanModelConfig
-) -> dict[str, str]:
+def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig) -> dict[str, str]:
     hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.box.pixel_footprint
     num_views, num_occupied = len(views.images), hull.cells.sum()
     sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
     # large cells may reach beyond the box
     num_cells = max(hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3)
-    first = hull.cell_size * 2**analysis.coarsening
-    finest = first / 2**analysis.max_level
-    step, pixels = config.step_size_voxels * hull.cell_size, pick_pixels(dict(enumerate(hit_pixels)))
-    rays = views.cameras.to(dtype=torch.float32).pixel_rays(pixels)
-    samples = OccupancyGrid.from_hull(hull).march(rays, step, None, (config.near, config.far))
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
     center = ", ".join(f"{value + 0.0:.2f}" for value in box.center.round(2))
-    share = np.mean(np.concatenate([hit.ravel() for hit in hit_pixels]))
-    wave = 2 * np.pi * float(analysis.grid().half_extent) / 2 ** (preset.position_frequencies - 1) / footprint
+    share = np.mean(np.concatenate([hit.ravel() for hit in analysis.hit_pixels]))
     return {
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
         "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",
         "cells": f"{hull.cell_size:.4f} a side, {hull.cell_size / footprint:.1f} pixels; {num_occupied:,} of "
-        f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)"
-        + (f"; training begins with {first:.4f}, subdivided to {finest:.4f} if dense" if first > finest else ""),
-        "voxel-nerf": _describe_levels(views, config, footprint),
-        "encoding": f"{preset.position_frequencies} frequencies of a position, the finest wave {wave:.1f} pixels long; "
-        f"what is finer is left to {config.feature_dim} features at every corner of a cell",
-        "network": f"{preset.depth} x {preset.width}, {preset.rays} rays a step, {preset.iterations:,} steps: size "
-        f"{config.size}, by the images' longer side",
-        "rays": f"{100 * share:.1f} % of the pixels may cross them; such a ray has "
-        f"{len(samples.t) / len(pixels):.1f} samples, {2 * box.half_extent / step:.0f} along all of its depth",
-        "sampling": "uniform among them"
+        f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)",
+        "levels": f"what training sees is subdivided {analysis.max_level} times, to about {config.voxel_size_px:g} "
+        f"pixels, as what was seen and {config.max_memory:.1f} GiB allow",
+        "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
+        "longer side",
+        "rays": f"{100 * share:.1f} % of the pixels may cross these cells",
+        "sampling": "by squared errors of earlier steps, among those pixels"
         if analysis.num_silhouettes
-        else "by edges as long as they pay, for nothing tells where the object is",
+        else "by edges as long as they pay, for nothing tells where the object is, then by squared errors",
     }

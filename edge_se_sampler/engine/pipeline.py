@@ -12,16 +12,13 @@ from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import ModelConfig, VoxelModelConfig
+from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
-from edge_se_sampler.occupancy.grid import OccupancyGrid
-from edge_se_sampler.occupancy.hull import find_hit_pixels
-from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_levels, analyze_scene
+from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
 
-Grid = OccupancyGrid | BrickGrid
 OTHER_WEIGHTS = "the checkpoint's weights are not this model's: another version wrote them"
 
 
@@ -34,21 +31,21 @@ class Pipeline:
     """A RayModel."""
 
     @classmethod
-    def build(cls, config: TrainerConfig, views: Views, device: str, saved_grid: Grid | None = None) -> Pipeline:
+    def build(cls, config: TrainerConfig, views: Views, device: str, saved_grid: BrickGrid | None = None) -> Pipeline:
         """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own. InputError
         if the checkpoint's grid is another scene's."""
         model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
         grid, has_masks = saved_grid, False
         if model_config.needs_grid:
             analysis = analyze_views(views, model_config)
-            grid = analysis.brick_grid() if isinstance(model_config, VoxelModelConfig) else analysis.grid()
+            grid = analysis.grid()
             has_masks = analysis.num_silhouettes > 0
-            if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):  # pyright: ignore
+            if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
                 changed = "its images, masks or cameras have changed since, or this machine rounds differently"
                 remedy = "restore the data, or begin a new training"
                 raise InputError(f"the scene's cells are not the checkpoint's: {changed}; {remedy}")
             if manager_config.skip_empty_rays and has_masks:
-                views = views.with_masks(find_hit_pixels(views, analysis.hull))
+                views = views.with_masks(analysis.hit_pixels)
         if isinstance(manager_config.pixel_sampler, SamplingSettings):
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
@@ -59,24 +56,20 @@ class Pipeline:
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
     """`analyze_scene` with a model's settings."""
     size_px, by_alpha = config.voxel_size_px, config.culls_by_alpha
-    if isinstance(config, VoxelModelConfig):
-        return analyze_levels(views, config.near, config.far, voxel_size_px=size_px, by_alpha=by_alpha)
-    prunable = config.prunes_cells
-    return analyze_scene(views, config.near, config.far, voxel_size_px=size_px, by_alpha=by_alpha, prunable=prunable)
+    return analyze_scene(views, config.near, config.far, voxel_size_px=size_px, by_alpha=by_alpha)
 
 
-def build_model(config: TrainerConfig, device: str, grid: Grid | None = None) -> RayModel:
+def build_model(config: TrainerConfig, device: str, grid: BrickGrid | None = None) -> RayModel:
     """The model with its initial weights: a function of the seed and the size alone, whatever the method."""
     rng = stream(config.machine.seed, 0, Stream.WEIGHTS)
     return config.pipeline.model.setup(rng=rng, grid=grid).to(device)
 
 
-def saved_grid(weights: Mapping[str, Tensor]) -> Grid | None:
+def saved_grid(weights: Mapping[str, Tensor]) -> BrickGrid | None:
     """The grid in a checkpoint's weights, None if it has none; InputError if another version wrote it."""
     state = {key.removeprefix("grid."): value for key, value in weights.items() if key.startswith("grid.")}
     try:
-        kind = BrickGrid if "bricks" in state else OccupancyGrid
-        return kind.from_state(state) if state else None
+        return BrickGrid.from_state(state) if state else None
     except KeyError as problem:
         raise InputError(OTHER_WEIGHTS) from problem
 

@@ -13,7 +13,7 @@ import torch
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.rendering import render_rays
-from edge_se_sampler.models.config import FieldModelConfig
+from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.field import NeRFField, initialize_linear
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.sampling.random_streams import Stream, stream
@@ -52,7 +52,7 @@ class DeadNetworkReset:
 
     def _reinitialize(self, field: NeRFField) -> int:
         config = self.model.config
-        assert isinstance(config, FieldModelConfig)
+        assert isinstance(config, NeRFModelConfig)
         self.used_sub_seeds += 1
         rng = stream(self.seed, self.used_sub_seeds, Stream.WEIGHTS)
         initialize_linear(field, config.initialization, rng)

@@ -18,25 +18,26 @@ from edge_se_sampler.data.downscale import downscale
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Grid, Pipeline, build_model, load_weights, saved_grid
+from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.models.config import NeRFModelConfig, VoxelModelConfig, apply_preset, decide_size
+from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig, apply_preset, decide_size
+from edge_se_sampler.models.lean import compile_ops
 from edge_se_sampler.models.ray_model import RayModel
-from edge_se_sampler.models.voxels import compile_ops
+from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
-def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: Grid | None = None) -> Trainer:
+def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
     views, device = read_train_views(config), choose_device(config.machine.device_type)
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else to_pictures(held_out)[0]
     config = resolve_config(config, views)
-    if isinstance(config.pipeline.model, VoxelModelConfig):
+    if isinstance(config.pipeline.model, LeanModelConfig):
         compile_ops(device)
     else:
         disable_malloc_trimming()
@@ -144,7 +145,7 @@ def describe_run(trainer: Trainer) -> str:
         f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
         f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",
     ]
-    if isinstance(model, VoxelModelConfig):
+    if isinstance(model, LeanModelConfig):
         grid = trainer.pipeline.model.grid
         lines.append(
             f"cells    {int(grid.occupied.sum()):,} of {float(grid.cell_size):.4f} a side, to be subdivided "

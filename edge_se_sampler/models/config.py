@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -13,7 +13,7 @@ from edge_se_sampler.protocol import InstantiateConfig
 
 INFINITY = float("inf")
 GIB_PER_PIXEL = 1 / 400
-"""Memory of the voxel model's cells, by the longest side of the images."""
+"""Memory of the lean model's cells, by the longest side of the images."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,9 @@ NERF_PRESETS = {
     "tiny": SizePreset(96, 2, 6, 2, 3e-3, 512, 1_500, num_coarse_samples=32, num_importance_samples=32),
 }
 LEAN_PRESETS = {
-    "paper": SizePreset(64, 1, 6, 2, 6e-3, 512, 30_000),
-    "small": SizePreset(64, 1, 6, 2, 6e-3, 512, 20_000),
-    "tiny": SizePreset(64, 1, 6, 2, 6e-3, 256, 12_000),
-}
-VOXEL_PRESETS = {
     "paper": SizePreset(64, 1, 0, 0, 7e-3, 8192, 7_000),
-    "small": SizePreset(64, 1, 0, 0, 7e-3, 8192, 4_000),
-    "tiny": SizePreset(64, 1, 0, 0, 7e-3, 8192, 2_000),
+    "small": SizePreset(64, 1, 0, 0, 7e-3, 4096, 5_000),
+    "tiny": SizePreset(64, 1, 0, 0, 7e-3, 2048, 4_000),
 }
 
 
@@ -71,8 +66,8 @@ class ModelConfig(InstantiateConfig):
     far: float = 6.0
     """Depth at which samples end, world units."""
     voxel_size_px: float = 1.0
-    """Size of a grid cell, in footprints of a pixel at the center of the scene; larger where there would be more cells
-    than are worth their memory."""
+    """A quarter of a grid cell's size, in footprints of a pixel at the center of the scene; larger where there would be
+    too many cells."""
 
     @property
     def preset(self) -> SizePreset:
@@ -94,11 +89,6 @@ class ModelConfig(InstantiateConfig):
         """Whether the grid is the visual hull of the alpha masks, where there are any."""
         return True
 
-    @property
-    def prunes_cells(self) -> bool:
-        """Whether training prunes the grid's cells."""
-        return False
-
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
         if not 0 <= self.near < self.far < INFINITY:
@@ -108,8 +98,10 @@ class ModelConfig(InstantiateConfig):
 
 
 @dataclass(frozen=True)
-class FieldModelConfig(ModelConfig):
-    """What models have whose network takes encoded positions and directions."""
+class NeRFModelConfig(ModelConfig):
+    """The original NeRF: two networks, coarse and fine."""
+
+    _target: ClassVar[type | str] = "edge_se_sampler.models.nerf:NeRFModel"
 
     width: int | None = None
     """Neurons of a layer."""
@@ -121,6 +113,14 @@ class FieldModelConfig(ModelConfig):
     """Frequencies that encode a direction."""
     initialization: Literal["xavier", "torch"] = "xavier"
     """Initial weights: Xavier with zero biases (the original), or torch's default (its ports)."""
+    num_coarse_samples: int | None = None
+    """Stratified samples along a ray."""
+    num_importance_samples: int | None = None
+    """Further samples for the fine network, drawn by the coarse one's weights."""
+    density_activation: Literal["relu", "softplus"] = "relu"
+    """What makes the raw density non-negative; softplus (shifted by 1, the last interval finite) cannot die."""
+    density_noise: float = 0.0
+    """Standard deviation of noise added to the raw density in training."""
     empty_space_skipping: bool = False
     """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
 
@@ -141,77 +141,18 @@ class FieldModelConfig(ModelConfig):
         for name in ("position", "direction"):
             frequencies = getattr(preset, f"{name}_frequencies")
             check_value(f"{prefix}{name}-frequencies", frequencies, 0 <= frequencies <= 24, "between 0 and 24")
-
-
-@dataclass(frozen=True)
-class NeRFModelConfig(FieldModelConfig):
-    """The original NeRF: two networks, coarse and fine."""
-
-    _target: ClassVar[type | str] = "edge_se_sampler.models.nerf:NeRFModel"
-
-    num_coarse_samples: int | None = None
-    """Stratified samples along a ray."""
-    num_importance_samples: int | None = None
-    """Further samples for the fine network, drawn by the coarse one's weights."""
-    density_activation: Literal["relu", "softplus"] = "relu"
-    """What makes the raw density non-negative; softplus (shifted by 1, the last interval finite) cannot die."""
-    density_noise: float = 0.0
-    """Standard deviation of noise added to the raw density in training."""
-
-    def check(self, prefix: str = "") -> None:
-        super().check(prefix)
-        coarse, fine = self.preset.num_coarse_samples, self.preset.num_importance_samples
+        coarse, fine = preset.num_coarse_samples, preset.num_importance_samples
         check_value(f"{prefix}num-coarse-samples", coarse, coarse >= 3, "at least 3")
         check_value(f"{prefix}num-importance-samples", fine, fine >= 1, "at least 1")
         check_value(f"{prefix}density-noise", self.density_noise, 0 <= self.density_noise < INFINITY, "at least 0")
 
 
 @dataclass(frozen=True)
-class LeanModelConfig(FieldModelConfig):
-    """One small network on a grid of features, evaluated only where the scene is."""
+class LeanModelConfig(ModelConfig):
+    """Density and features at the corners of sparse cells, and a small network for color."""
 
     _target: ClassVar[type | str] = "edge_se_sampler.models.lean:LeanModel"
     presets: ClassVar[Mapping[str, SizePreset]] = LEAN_PRESETS
-
-    empty_space_skipping: bool = True
-    """Sample only cells that may hold something, by cull-by-alpha and cull-by-density; off: all of the box."""
-    cull_by_alpha: bool = True
-    """Leave out what lies outside the visual hull of the alpha masks."""
-    cull_by_density: bool = True
-    """Leave out cells in which training has seen no density; some of them are reactivated now and then."""
-    step_size_voxels: float = 1.0
-    """Distance between samples, as a multiple of a cell's size."""
-    feature_dim: int = 8
-    """Features at each corner of a cell; 0: the network has the encoded position alone."""
-    feature_lr_scale: float = 6.0
-    """Learning rate of the features, as a multiple of the network's."""
-
-    @property
-    def needs_grid(self) -> bool:
-        return True  # the features lie at its corners
-
-    @property
-    def culls_by_alpha(self) -> bool:
-        return self.empty_space_skipping and self.cull_by_alpha
-
-    @property
-    def prunes_cells(self) -> bool:
-        return self.empty_space_skipping and self.cull_by_density
-
-    def check(self, prefix: str = "") -> None:
-        super().check(prefix)
-        step, scale = self.step_size_voxels, self.feature_lr_scale
-        check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
-        check_value(f"{prefix}feature-dim", self.feature_dim, 0 <= self.feature_dim <= 64, "between 0 and 64")
-        check_value(f"{prefix}feature-lr-scale", scale, 0 < scale < INFINITY, "above 0")
-
-
-@dataclass(frozen=True)
-class VoxelModelConfig(ModelConfig):
-    """Density and features at the corners of sparse cells, and a small network for color."""
-
-    _target: ClassVar[type | str] = "edge_se_sampler.models.voxels:VoxelModel"
-    presets: ClassVar[Mapping[str, SizePreset]] = VOXEL_PRESETS
 
     voxel_size_px: float = 1.0
     """About the size of the finest cells, in footprints of a pixel at the center of the scene; as memory and what was
@@ -244,10 +185,6 @@ class VoxelModelConfig(ModelConfig):
     @property
     def culls_by_alpha(self) -> bool:
         return self.cull_by_alpha
-
-    @property
-    def prunes_cells(self) -> bool:
-        return True
 
     def check(self, prefix: str = "") -> None:
         super().check(prefix)
@@ -302,11 +239,11 @@ class InfoNeRFModelConfig(NeRFModelConfig):
 Model = TypeVar("Model", bound=ModelConfig)
 
 
-def decide_size(config: Model, images: Iterable[np.ndarray]) -> Model:
-    """The config with what is left to the images (H, W, 3|4), size "auto" and the voxel model's memory, replaced by
-    what suits their longest side."""
+def decide_size(config: Model, images: Sequence[np.ndarray]) -> Model:
+    """The config with what is left to the training images (H, W, 3|4) replaced by what suits them: size "auto" by their
+    longest side, and the lean model's memory."""
     longest = max(max(image.shape[:2]) for image in images)
-    if isinstance(config, VoxelModelConfig) and config.max_memory is None:
+    if isinstance(config, LeanModelConfig) and config.max_memory is None:
         config = replace(config, max_memory=round(GIB_PER_PIXEL * longest, 3))
     if config.size != "auto":
         return config

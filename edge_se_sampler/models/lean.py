@@ -1,159 +1,274 @@
-"""The lean model: one small network on a grid of features, evaluated only where the scene is.
+"""The voxel model: density and features at the corners of sparse cells, and a small network that turns features and
+direction into color. Training begins with large cells, and subdivides those that it sees something in.
 
-h       size of a cell at level 0, world units
-sigma   exp(raw) / h, density: independent of the scene's scale, and never 0, so that no network can die
+The parts are known: features at the corners of sparse voxels, pruned and subdivided (NSVF, Liu et al. 2020), density
+asked first and color only where it counts (DVGO, Sun et al. 2022; Plenoxels, Fridovich-Keil et al. 2022), an occupancy
+grid with early termination (instant-ngp, Mueller et al. 2022), a visual hull (VaxNeRF, Kondo et al. 2021).
+
+h      size of a cell of the finest level, world units
+raw    logarithm of the optical depth across h: it can never make the density 0, so nothing can die
 """
 
 from __future__ import annotations
 
 import math
+import sys
+import time
+from functools import cache
+from importlib.util import find_spec
+from types import ModuleType
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.models import voxel_ops
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.field import encoded_size, initialize_linear, linear, positional_encoding
-from edge_se_sampler.models.packed_rendering import (
-    accumulate_along_rays,
-    expand_to_samples,
-    render_packed,
-    transmittance,
-)
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
-from edge_se_sampler.occupancy.features import FeatureGrid
-from edge_se_sampler.occupancy.grid import MAX_OCCUPIED_CELLS, OccupancyGrid, dilate, upsample
+from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
+from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
-DENSITY_BIAS = -1.0
-"""Raw density at first: thin enough to see through the object, dense enough to have a gradient. In an uncarved box it
-would be an opaque fog: there, the box has an optical depth of 1 across."""
-UPDATE_INTERVAL = 128
-"""Steps between prunings: long enough for the cells to be seen. Half as many as long as the cells may be subdivided."""
-ALPHA_THRESHOLD = 0.01
-"""Opacity of a cell of the finest level below which it counts as empty."""
-MIN_OPTICAL_DEPTH = 0.5
-"""Optical depth above which a cell counts as surface; while no cell of a grid that may be subdivided has it, pruning is
-suspended."""
+FEATURE_DIM, WIDTH = 16, 64
+"""Features at a corner, and neurons of the hidden layer. The compiled kernels know no others."""
+INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
+"""Denser than the maximum is as opaque, and slow to become transparent again."""
+LAST_SUBDIVISION, LEVEL_RATIO = 0.45, 0.45
+"""Part of the training after which the finest level begins, and by which each level ends before the next one does."""
+UNSETTLED = 0.4
+"""Part of a level whose weights are not looked at when cells are pruned: they still move."""
+STEPS_PER_SAMPLED = 50
+"""Steps after which cells that have become transparent are found again."""
+TRANSPARENT_MARGIN = 0.7
+"""How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
+ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.25, 1.5
+"""Rows that there may be, once cells are smaller than was planned, for each weight that was seen before, and for each
+pixel of the training images that shows something: what is hardly seen is not learned any better in smaller cells, and
+with more numbers than there are in the images the model remembers rather than learns."""
+MAX_RATIO = 0.8
+"""Cells that would be larger than this part of the present ones are not worth subdividing."""
+BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
+"""Density, features, the running means of their gradients and those of squares, and what the grid keeps of a row."""
 
 
-class LeanField(nn.Module):
-    """Position, features and direction -> density and color. `rng` draws the initial weights."""
+def choose_ops(weight: Tensor) -> ModuleType:
+    """What renders a model with such weights: `voxel_kernels`, with as many threads as torch has, for float32 on a CPU
+    where numba is installed; else plain torch."""
+    ops = compiled_ops() if weight.device.type == "cpu" and weight.dtype == torch.float32 else None
+    if ops is None:
+        return voxel_ops
+    ops.set_num_threads(torch.get_num_threads())
+    return ops
 
-    def __init__(self, config: LeanModelConfig, rng: np.random.Generator) -> None:
+
+@cache
+def compiled_ops() -> ModuleType | None:
+    """`voxel_kernels`; None without numba."""
+    if find_spec("numba") is None:
+        hint = 'pip install "edge-se-sampler[fast]" makes this model much faster on a CPU'
+        print(f"edge-se: numba is not installed; {hint}", file=sys.stderr)
+        return None
+    from edge_se_sampler.models import voxel_kernels
+
+    return voxel_kernels
+
+
+def compile_ops(device: str) -> None:
+    """Compile the kernels for models on a device, if there are any, and say how long it took if it took long: numba
+    keeps them for the next time."""
+    ops, began = device == "cpu" and compiled_ops(), time.monotonic()
+    if not ops:
+        return
+    cells = torch.ones((1, 1, 1), dtype=torch.bool)
+    grid = BrickGrid.from_cells(torch.zeros(3), 1.0, cells, max_level=1)
+    model = LeanModel(LeanModelConfig(size="tiny", near=0.0), np.random.default_rng(0), grid)
+    norm = {"directions_norm": torch.ones(1, 1)}
+    ray = RayBundle(torch.full((1, 3), 0.1), torch.full((1, 3), 3**-0.5), torch.zeros((1, 1), dtype=torch.int64), norm)
+    loss, _ = model.training_loss(ray, {"image": torch.rand(1, 4)})
+    loss.sum().backward()
+    for weight in (model.density, model.features):
+        rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
+        ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
+        ops.find_dense_cells(grid, weight.data, 0.0)
+        ops.resample(grid.subdivide(cells, 0.5).bricks, 0.5, grid.numbers, weight.data)
+    if time.monotonic() - began > 5:
+        print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)
+
+
+class ColorNetwork(nn.Module):
+    """The weights of `voxel_ops.shade`'s network. `rng` draws the initial ones."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
         super().__init__()
-        preset = config.preset
-        self.position_frequencies = preset.position_frequencies
-        self.direction_frequencies = preset.direction_frequencies
-        width, in_dim = preset.width, encoded_size(3, preset.position_frequencies) + config.feature_dim
-        self.layers = nn.ModuleList(linear(width if i else in_dim, width) for i in range(preset.depth))
-        self.density = linear(width, 1)
-        self.view = linear(width + encoded_size(3, self.direction_frequencies), width)
-        self.color = linear(width, 3)
-        initialize_linear(self, config.initialization, rng)
 
-    def forward(
-        self, positions: Tensor, features: Tensor, directions: Tensor, ray_starts: Tensor, ray_indices: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Raw density (m,) and color (m, 3) in [0, 1] of packed samples (`Samples`).
+        def draw(shape: tuple[int, int], variance: float) -> nn.Parameter:
+            return nn.Parameter(torch.from_numpy(rng.normal(size=shape) * math.sqrt(variance)).float())
 
-        Args:
-            positions: (m, 3), -1 .. 1 along the longest edge of the box.
-            features: (m, F).
-            directions: (n, 3) unit.
-        """
-        h = torch.cat((positional_encoding(positions, self.position_frequencies), features), dim=1)
-        for layer in self.layers:
-            h = F.relu(layer(h), inplace=True)
-        width = h.shape[1]
-        encoded = positional_encoding(directions, self.direction_frequencies)
-        per_ray = F.linear(encoded, self.view.weight[:, width:], self.view.bias)
-        seen = F.linear(h, self.view.weight[:, :width]) + expand_to_samples(per_ray, ray_starts, ray_indices)
-        seen = F.relu(seen, inplace=True)
-        return self.density(h)[:, 0] + DENSITY_BIAS, torch.sigmoid(self.color(seen))
+        self.hidden = draw((FEATURE_DIM, WIDTH), 2 / FEATURE_DIM)
+        self.view, self.view_bias = draw((NUM_HARMONICS, WIDTH), 0.5 / NUM_HARMONICS), nn.Parameter(torch.zeros(WIDTH))
+        self.color, self.color_bias = draw((3, WIDTH), 1 / WIDTH), nn.Parameter(torch.zeros(3))
+
+    def weights(self) -> NetworkWeights:
+        return NetworkWeights(self.hidden, self.view, self.view_bias, self.color, self.color_bias)
 
 
 class LeanModel(RayModel):
-    """One network, evaluated in the grid's occupied cells alone; features lie at their corners. Training prunes and
-    subdivides them. `rng` draws the initial weights."""
+    """Sparse cells that training prunes and subdivides. `rng` draws the initial weights."""
 
     config: LeanModelConfig
-    grid: OccupancyGrid
+    grid: BrickGrid
 
-    def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: OccupancyGrid) -> None:
+    def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
-        self.fine = LeanField(config, rng)
-        box = grid.static_mask_at(0)[1:-1, 1:-1, 1:-1]  # without the rim
-        if box.float().mean() > 0.9:  # uncarved: the object may be anywhere
-            with torch.no_grad():
-                self.fine.density.bias.sub_(math.log(max(box.shape)) + DENSITY_BIAS)
-        self.features = FeatureGrid(grid, config.feature_dim) if config.feature_dim else None
+        self.fine = ColorNetwork(rng)
+        uncarved = grid.occupied.sum() > 0.9 * grid.size.prod()
+        across = float(grid.size.max()) * 2 ** int(grid.max_level)
+        raw = -math.log(across) if uncarved else INITIAL_RAW_DENSITY  # an uncarved box: optical depth 1 across
+        self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
+        draws = rng.standard_normal((grid.num_rows, FEATURE_DIM), dtype=np.float32) * np.float32(0.01)
+        self.features = nn.Parameter(torch.from_numpy(draws))
+
+    @property
+    def marching(self) -> Marching:
+        """How rays are sampled in the grid's cells."""
+        step = self.config.step_size_voxels
+        density_scale = step * float(self.grid.cell_size / self.grid.finest_size)
+        config = self.config
+        thresholds = config.alpha_threshold, config.weight_threshold, config.transmittance_threshold
+        return Marching(step, density_scale, *thresholds)
 
     @property
     def rays_per_chunk(self) -> int:
-        return 4096
+        return 2**14
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        if self.features is None:
-            return super().parameter_groups()
-        # the features learn faster than the network: each sees few samples
-        network, table = list(self.fine.parameters()), [self.features.table]
-        return [ParameterGroup(network), ParameterGroup(table, self.config.feature_lr_scale)]
-
-    def begin_step(self, step: int, seed: int) -> None:
-        """As `RayModel`; at intervals, prunes and subdivides the grid."""
-        super().begin_step(step, seed)
-        grid = self.grid
-        if not self.config.prunes_cells:
-            return
-        subdivisible = bool(grid.level < grid.max_level)
-        interval = UPDATE_INTERVAL // 2 if subdivisible else UPDATE_INTERVAL
-        if step < interval or step % interval:
-            return
-        surface = grid.max_density * grid.cell_size > MIN_OPTICAL_DEPTH
-        if step == interval or (subdivisible and not surface.any()):  # the first densities mean nothing
-            grid.max_density.zero_()
-            return
-        fraction = 0.02 / 2 ** int(grid.level)  # of the empty cells; a level has eight times those of the one before
-        reactivated = torch.rand(grid.occupied.shape, generator=self.random, device=self.device) < fraction
-        min_density = -math.log1p(-ALPHA_THRESHOLD) / float(grid.initial_cell_size / 2**grid.max_level)
-        dense = grid.prune(min_density, reactivated)
-        self._refine(dense, surface)
-
-    def _refine(self, dense: Tensor, surface: Tensor) -> None:
-        """Subdivide the grid, at level 0 always, later when its cells are few enough; else refine surface cells that
-        pruning had missed, if they are above 1 % of all. Both (X, Y, Z) bool: cells that pruning has kept, and those
-        that count as surface."""
-        grid, features, level = self.grid, self.features, int(self.grid.level)
-        if level < grid.max_level and (level == 0 or 8 * dense.sum() <= MAX_OCCUPIED_CELLS):
-            grid.subdivide() if features is None else features.refine(upsample(dense) & grid.static_mask_at(level + 1))
-        elif features is not None and level:
-            missed = surface & ~grid.refined
-            refined = grid.refined | (dilate(missed) & grid.static_mask)
-            if missed.sum() > 0.01 * surface.sum() and refined.sum() <= MAX_OCCUPIED_CELLS:
-                features.refine(refined)
+        """The network; density and features learn faster, for each sees few samples."""
+        return [
+            ParameterGroup(list(self.fine.parameters())),
+            ParameterGroup([self.density], self.config.density_lr_scale, maximum=MAX_RAW_DENSITY),
+            ParameterGroup([self.features], self.config.feature_lr_scale, total_variation=self.config.total_variation),
+        ]
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`; depth_fine in evaluation alone."""
-        grid = self.grid
-        step = self.config.step_size_voxels * float(grid.cell_size)
-        jitter = self.uniform(len(rays), 1) if self.training else None
-        samples = grid.march(rays, step, jitter, (self.config.near, self.config.far))
-        positions = samples.positions
-        features = positions[:, :0] if self.features is None else self.features(positions, samples.cell_indices)
-        centered = (positions - grid.center) / grid.half_extent
-        raw, color = self.fine(centered, features, rays.directions, samples.ray_starts, samples.ray_indices)
-        density = torch.exp(raw.clamp(max=8)) / float(grid.initial_cell_size)  # more is as opaque
-        if self.training and self.config.prunes_cells:
-            grid.update_max_density(samples, density)
-        rgb, accumulation = render_packed(density, color, step, samples.ray_starts, samples.ray_indices)
-        background = self.get_background(rays)
-        outputs = {"rgb_fine": rgb + (1 - accumulation) * background, "accumulation_fine": accumulation}
+        return self._render(rays)[0]
+
+    def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """As `RayModel`; remembers the largest weight in each cell."""
+        outputs, rendered = self._render(rays)
+        if self.grid.level < self.grid.max_level:
+            self.grid.update_max_weight(rendered.cells, rendered.weights)
+        return self.loss(outputs, batch)
+
+    def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """As `RayModel`; plus, where there is alpha, the squared error of the accumulated opacity."""
+        loss, error = super().loss(outputs, batch)
+        if self.config.alpha_loss and batch["image"].shape[1] == 4:
+            difference = outputs["accumulation_fine"][:, 0] - batch["image"][:, 3]
+            loss = loss + self.config.alpha_loss / 3 * batch.get("weight", 1.0) * difference.square()
+        return loss, error
+
+    def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
+        """Outputs of `forward`, and what they were made of."""
+        spans, jitter = self._spans(rays), self.uniform(len(rays), 1)[:, 0] if self.training else None
+        weights = self.density, self.features, self.fine.weights()
+        rendered = choose_ops(self.density).render(self.grid, *weights, spans, jitter, self.marching)
+        background, passing = self.get_background(rays), 1 - rendered.accumulation
+        outputs = {"rgb_fine": rendered.rgb + passing * background, "accumulation_fine": rendered.accumulation}
         if not self.training:
-            tau = density * step
-            weight = transmittance(tau, samples.ray_starts, samples.ray_indices) * -torch.expm1(-tau)
-            far = self.config.far * rays.metadata["directions_norm"]
-            depth = accumulate_along_rays((weight * samples.t)[:, None], samples.ray_starts)
-            outputs["depth_fine"] = depth + (1 - accumulation) * far
-        return outputs | {"background": background}
+            depth = rendered.distance * float(self.grid.cell_size)
+            outputs["depth_fine"] = depth + passing * self.config.far * rays.metadata["directions_norm"]
+        return outputs | {"background": background}, rendered
+
+    def _spans(self, rays: RayBundle) -> RaySpans:
+        """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it."""
+        cell_size = self.grid.cell_size
+        origins = ((rays.origins - self.grid.aabb_min) / cell_size).to(self.dtype)
+        inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
+        one, other = -origins * inverse, (self.grid.size - origins) * inverse
+        norm = rays.metadata["directions_norm"][:, 0] / float(cell_size)
+        begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
+        end = torch.maximum(one, other).amin(dim=1)
+        return RaySpans(
+            origins,
+            rays.directions,
+            torch.maximum(begin, self.config.near * norm),
+            torch.minimum(end, self.config.far * norm),
+        )
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Prunes and subdivides cells, by the part of the training that is done; now and then finds those that have
+        become transparent."""
+        trainer = attributes.trainer
+
+        def update_cells(step: int) -> None:
+            if step % STEPS_PER_SAMPLED == 0:
+                self.update_sampled()
+            self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step))
+
+        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], update_cells)]
+
+    @torch.no_grad()
+    def update_cells(self, before: float, now: float) -> None:
+        """Do what is due as training goes on from one part of it to the next, both in [0, 1]."""
+        grid = self.grid
+        begin, end = self._level_span()
+        if before < begin + UNSETTLED * (end - begin) <= now:
+            grid.reset_max_weight()
+        # before that many weights are seen, nobody knows which cells are empty
+        if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
+            self._subdivide()
+
+    @torch.no_grad()
+    def update_sampled(self) -> None:
+        """Sample no cells in which the density is too low to be seen, nor can learn to be higher."""
+        least = self.marching.density_min - TRANSPARENT_MARGIN
+        self.grid.set_sampled(choose_ops(self.density).find_dense_cells(self.grid, self.density, least))
+
+    def _level_span(self) -> tuple[float, float]:
+        """Parts of the training at which the grid's level begins and ends."""
+        remaining = int(self.grid.max_level - self.grid.level)
+        begin, end = (LAST_SUBDIVISION * LEVEL_RATIO ** (levels - 1) for levels in (remaining + 1, remaining))
+        return begin if self.grid.level else 0.0, end if remaining else 1.0
+
+    def _find_seen(self) -> Tensor:
+        """(X, Y, Z) bool: cells that had a weight in some color. FloatingPointError: there are none."""
+        seen = self.grid.occupied.reshape(-1) & (self.grid.max_weight > self.config.prune_weight)
+        if not seen.any():
+            raise FloatingPointError("no cell has anything in it any more; try a lower --optimizer.lr, or a longer run")
+        return self.grid.to_cells(seen)
+
+    def _subdivide(self) -> None:
+        """Subdivide the cells that were seen, and those around them, as far as memory and what was seen allow."""
+        grid = self.grid
+        finer = self._find_finer(self._find_seen())
+        if finer is None:
+            grid.level += 1
+            grid.reset_max_weight()
+            return
+        ratio = float(finer.cell_size / grid.cell_size)
+        for parameter in (self.density, self.features):
+            parameter.grad = None
+            parameter.data = choose_ops(self.density).resample(finer.bricks, ratio, grid.numbers, parameter.data)
+        self.grid = finer
+        self.update_sampled()
+
+    def _find_finer(self, kept: Tensor) -> BrickGrid | None:
+        """Those of the grid's cells that are kept, halved; at last smaller, if enough was seen for more rows; larger,
+        if memory is too little. None: it is too little even for cells that are worth subdividing."""
+        grid, ratio = self.grid, 0.5
+        assert self.config.max_memory is not None  # the config is resolved
+        finer = grid.subdivide(kept, float(grid.cell_size) / 2)
+        last = grid.level + 1 == grid.max_level
+        learnable = min(ROWS_PER_SEEN * int(grid.num_seen), ROWS_PER_PIXEL * int(grid.num_pixels)) if last else 0
+        wanted = min(max(finer.num_rows, learnable), self.config.max_memory * 2**30 / BYTES_PER_ROW)
+        for _ in range(4):
+            better = max(ratio * (finer.num_rows / wanted) ** 0.4, 0.25)  # surfaces are layers of some cells
+            if better > MAX_RATIO:
+                return None
+            if 0.95 < better / ratio < 1.05:
+                break
+            ratio = better
+            finer = grid.subdivide(kept, ratio * float(grid.cell_size))
+        return finer

@@ -11,7 +11,7 @@ from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.field import NeRFField
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.models.rendering import composite, importance, intervals, sample_weights, stratified
-from edge_se_sampler.occupancy.grid import OccupancyGrid
+from edge_se_sampler.occupancy.bricks import BrickGrid
 
 POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
 """Points evaluated at once, by device: bounds the memory. Each chunk draws its own jitter, so another value gives
@@ -22,9 +22,9 @@ class NeRFModel(RayModel):
     """Coarse and fine networks, stratified and importance samples. `rng` draws the initial weights."""
 
     networks = ("coarse", "fine")
-    grid: OccupancyGrid | None
+    grid: BrickGrid | None
 
-    def __init__(self, config: NeRFModelConfig, rng: np.random.Generator, grid: OccupancyGrid | None = None) -> None:
+    def __init__(self, config: NeRFModelConfig, rng: np.random.Generator, grid: BrickGrid | None = None) -> None:
         super().__init__(config, grid)
         self.config = config
         self.num_coarse_samples = config.preset.num_coarse_samples

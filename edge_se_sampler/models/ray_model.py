@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.occupancy.bricks import BrickGrid
-from edge_se_sampler.occupancy.grid import OccupancyGrid
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes
 
 
@@ -36,7 +35,7 @@ class RayModel(nn.Module, ABC):
     networks: tuple[str, ...] = ("fine",)
     """Names of the networks, each an attribute; the colors of "fine" are the model's."""
 
-    def __init__(self, config: ModelConfig, grid: OccupancyGrid | BrickGrid | None) -> None:
+    def __init__(self, config: ModelConfig, grid: BrickGrid | None) -> None:
         super().__init__()
         self.config = config
         self.grid = grid

@@ -36,6 +36,7 @@ class BrickGrid(nn.Module):
         bricks: (k, 3) int64: positions of the bricks that hold occupied cells, in bricks.
         occupied: (k, 64) bool: which of their cells are.
         max_level: how often the cells may be subdivided.
+        num_pixels: pixels of the training images that show something of the scene.
     """
 
     aabb_min: Tensor
@@ -56,6 +57,8 @@ class BrickGrid(nn.Module):
     """() int64: how often the cells have been subdivided, or were found to be small enough, 0 .. max_level."""
     max_level: Tensor
     """() int64."""
+    num_pixels: Tensor
+    """() int64."""
     scene: Tensor
     """(32,) uint8: digest of the box and the cells at level 0."""
     neighbors: Tensor
@@ -70,14 +73,22 @@ class BrickGrid(nn.Module):
     transparent."""
 
     def __init__(
-        self, aabb_min: Tensor, cell_size: float, size: Sequence[int], bricks: Tensor, occupied: Tensor, max_level: int
+        self,
+        aabb_min: Tensor,
+        cell_size: float,
+        size: Sequence[int],
+        bricks: Tensor,
+        occupied: Tensor,
+        max_level: int,
+        num_pixels: int,
     ) -> None:
         super().__init__()
         content = [values.cpu().numpy().tobytes() for values in (aabb_min.double(), bricks, occupied)]
-        digest = hashlib.sha256(b"".join(content) + str((cell_size, *size, max_level)).encode()).digest()
+        digest = hashlib.sha256(b"".join(content) + str((cell_size, *size, max_level, num_pixels)).encode()).digest()
         self.register_buffer("scene", torch.tensor(list(digest), dtype=torch.uint8))
         self.register_buffer("level", torch.tensor(0))
         self.register_buffer("max_level", torch.tensor(max_level))
+        self.register_buffer("num_pixels", torch.tensor(num_pixels))
         self.register_buffer("finest_size", torch.tensor(cell_size / 2**max_level, dtype=torch.float64))
         self.register_buffer("num_seen", torch.tensor(0))
         self.register_buffer("aabb_min", aabb_min.double())
@@ -92,13 +103,15 @@ class BrickGrid(nn.Module):
         self.set_sampled(pack_bits(stored))
 
     @classmethod
-    def from_cells(cls, aabb_min: Tensor, cell_size: float, cells: Tensor, max_level: int = 0) -> BrickGrid:
+    def from_cells(
+        cls, aabb_min: Tensor, cell_size: float, cells: Tensor, max_level: int = 0, num_pixels: int = 0
+    ) -> BrickGrid:
         """A box's cells (X, Y, Z) bool, of which those are occupied."""
         padded = F.pad(cells, [pad for size in reversed(cells.shape) for pad in (0, -size % BRICK)])
         x, y, z = (size // BRICK for size in padded.shape)
         blocks = padded.reshape(x, BRICK, y, BRICK, z, BRICK).permute(0, 2, 4, 1, 3, 5).flatten(3)
         bricks = torch.nonzero(blocks.any(dim=3))
-        return cls(aabb_min, cell_size, cells.shape, bricks, blocks[tuple(bricks.T)], max_level)
+        return cls(aabb_min, cell_size, cells.shape, bricks, blocks[tuple(bricks.T)], max_level, num_pixels)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor]) -> BrickGrid:
@@ -179,6 +192,15 @@ class BrickGrid(nn.Module):
         brick = torch.gather(self.neighbors[bricks].long(), 1, neighbor)
         return torch.where(brick < 0, -1, 64 * brick + corner)
 
+    def contains(self, positions: Tensor) -> Tensor:
+        """(m,) bool: whether positions (m, 3), world units, are in occupied cells."""
+        cell = ((positions - self.aabb_min) / self.cell_size).floor().long()
+        inside = ((cell >= 0) & (cell < self.size)).all(dim=1)
+        brick = self.numbers[tuple(torch.where(inside[:, None], cell // BRICK, -1).T)].long()  # -1: none of the bricks
+        inside = brick >= 0
+        x, y, z = (cell[inside] % BRICK).unbind(dim=1)
+        return inside.masked_scatter(inside, self.occupied[brick[inside], (x * BRICK + y) * BRICK + z])
+
     def subdivide(self, kept: Tensor, cell_size: float) -> BrickGrid:
         """The same box in smaller cells, of at least h / 4. Occupied are those whose center is in an occupied cell, and
         that are in, or next to one in, cells (X, Y, Z) bool that are kept."""
@@ -200,9 +222,8 @@ class BrickGrid(nn.Module):
             occupied.append((around & inner).flatten(1))
         occupied = torch.cat(occupied)
         some = occupied.any(dim=1)
-        finer = BrickGrid(
-            self.aabb_min, cell_size, size.tolist(), bricks[some], occupied[some], int(self.max_level)
-        ).to(kept.device)
+        scene = int(self.max_level), int(self.num_pixels)
+        finer = BrickGrid(self.aabb_min, cell_size, size.tolist(), bricks[some], occupied[some], *scene).to(kept.device)
         finer.level, finer.finest_size, finer.scene = self.level + 1, self.finest_size, self.scene
         return finer
 

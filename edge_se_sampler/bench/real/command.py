@@ -13,7 +13,7 @@ from edge_se_sampler.errors import InputError, check_known, check_value
 
 @dataclass(frozen=True, kw_only=True)
 class BenchReal(ExperimentCommand):
-    """Train voxel-nerf on real scenes with time budgets, one training at a time on all cores, and tabulate test PSNR.
+    """Train lean-nerf on real scenes with time budgets, one training at a time on all cores, and tabulate test PSNR.
     Resumes."""
 
     scenes_dir: Path
@@ -24,7 +24,7 @@ class BenchReal(ExperimentCommand):
     """Of NeRF's 800 x 800 pixels."""
     budgets: tuple[str, ...] = ("1m", "3m")
     """Time budgets, as in edge-se train."""
-    variants: tuple[str, ...] = ("voxel-nerf",)
+    variants: tuple[str, ...] = ("lean-nerf",)
     """By their labels in the page; one thing is changed in each."""
 
     def experiment(self) -> Experiment:

@@ -10,7 +10,7 @@ from typing import Any
 from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
 
-BASELINE = "voxel-nerf"
+BASELINE = "lean-nerf"
 NERF_PIXELS = 800
 TEST_VIEWS = 25
 Key = tuple[str, int, str]

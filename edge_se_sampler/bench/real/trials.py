@@ -1,4 +1,4 @@
-"""Trainings of voxel-nerf on real scenes, each with a time budget on all of the machine's cores."""
+"""Trainings of lean-nerf on real scenes, each with a time budget on all of the machine's cores."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.methods import method_configs
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "voxel-nerf": {},
+    "lean-nerf": {},
     "uniform pixels": {f"{SAMPLER}.late": "uniform", f"{SAMPLER}.error_source": "fine"},
     "no hull": {f"{MODEL}.cull_by_alpha": False},
     "no total variation": {f"{MODEL}.total_variation": 0.0},
@@ -77,7 +77,7 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
         **VARIANTS[trial.variant],
     }
     with contextlib.redirect_stderr(io.StringIO()):
-        trainer = prepare(override(method_configs()["voxel-nerf"], changes))
+        trainer = prepare(override(method_configs()["lean-nerf"], changes))
         start = time.process_time()
         trainer.train()
     cpu_seconds = time.process_time() - start
