@@ -61,7 +61,7 @@ def test_trainings_that_are_compared_are_neighbors(tmp_path: Path) -> None:
 
 def test_a_training_fills_its_time_and_is_evaluated_on_the_way(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "EVAL_SECONDS", (0.2, 0.4, 1.0, 1.5))
-    run = train_and_evaluate(Trial("lean", "mic", 1), ChartSettings(seconds=2.5), data)
+    run = train_and_evaluate(Trial("edge", "mic", 1), ChartSettings(seconds=4), data)
     curve = np.array(run["curve"])
     assert (np.diff(curve[:, :3], axis=0) > 0).all()  # seconds, steps, queries
     assert len(curve) >= 2
@@ -69,6 +69,14 @@ def test_a_training_fills_its_time_and_is_evaluated_on_the_way(data: Path, monke
     assert run["steps"] <= run["planned_steps"]
     assert 0 < run["ready_seconds"] < run["curve"][0][0]
     assert json.loads(json.dumps(run)) == run
+
+
+def test_lean_nerf_is_trained_anew_for_every_budget(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trials_module, "BUDGETS", (0.7, 1, 3))
+    run = train_and_evaluate(Trial("lean", "mic", 1), ChartSettings(seconds=2.5), data)
+    assert [seconds for seconds, *_ in run["curve"]] == [pytest.approx(s, rel=0.3) for s in (0.7, 1, 2.5)]
+    assert run["steps"] == run["planned_steps"] == run["curve"][-1][1]
+    assert run["psnr"] == pytest.approx(run["curve"][-1][-1], abs=1e-3)
 
 
 def test_peak_memory_is_the_trainings_alone(data: Path) -> None:
@@ -87,7 +95,7 @@ def ticks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("ticks")
 def test_a_plan_that_misses_its_time_is_made_again(guess: int, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "iterations_within", lambda config, settings: guess)
-    run = train_and_evaluate(Trial("lean", "mic", 1), ChartSettings(seconds=1.5), data)
+    run = train_and_evaluate(Trial("edge", "mic", 1), ChartSettings(seconds=1.5), data)
     assert run["planned_steps"] == pytest.approx(149, abs=2)
     assert run["steps"] == run["planned_steps"]
     assert run["seconds"] == pytest.approx(1.5, abs=0.02)
@@ -95,7 +103,7 @@ def test_a_plan_that_misses_its_time_is_made_again(guess: int, data: Path, monke
 
 @pytest.mark.usefixtures("ticks")
 def test_a_plan_has_as_many_iterations_as_fit(data: Path, tmp_path: Path) -> None:
-    config = config_of(Trial("lean", "mic", 0), data, tmp_path)
+    config = config_of(Trial("edge", "mic", 0), data, tmp_path)
     assert [iterations_within(config, ChartSettings(seconds)) for seconds in (2, 4)] == [199, 399]
 
 
@@ -148,7 +156,7 @@ def test_medians_over_seeds_then_means_over_scenes() -> None:
 def test_only_common_scenes_and_seeds_are_compared() -> None:
     runs = [run_of("lean", scene, 0, [(1, 20)]) for scene in ("mic", "chair")] + [run_of("edge", "mic", 0, [(1, 9)])]
     assert {run["scene"] for found in comparable(by_variant(runs)).values() for run in found} == {"mic"}
-    runs += [run_of("lean", "mic", 1, [(1, 20)]), run_of("rays-128", "chair", 0, [(1, 20)])]
+    runs += [run_of("lean", "mic", 1, [(1, 20)]), run_of("rays-8192", "chair", 0, [(1, 20)])]
     methods = comparable(by_variant(runs, ["methods"]))
     assert {name: [run["seed"] for run in found] for name, found in methods.items()} == {"lean": [0], "edge": [0]}
     assert {run["scene"] for run in comparable(by_variant(runs, ["size"]))["lean"]} == {"chair"}
@@ -215,7 +223,7 @@ def test_curves_of_a_single_evaluation_are_drawn() -> None:
     np.testing.assert_array_equal(drawn[0].get_xydata(), [[3, 21.5]])
     labels = [text.get_text() for text in draw_scenes(runs, {}, ChartSettings(seconds=2)).legends[0].get_texts()]
     assert sorted(labels) == ["Edge", "lean-nerf"]  # once each, whatever the seeds
-    parts = [run_of("no-hull", "mic", 0, [(1, 20)], "collapsed"), run_of("rays-128", "chair", 0, [(1, 22)])]
+    parts = [run_of("no-hull", "mic", 0, [(1, 20)], "collapsed"), run_of("rays-8192", "chair", 0, [(1, 22)])]
     mic, chair = draw_scenes(parts, {}, ChartSettings(seconds=2)).axes[1::-1]
     assert [line.get_marker() for line in mic.lines] == ["None", "x"]
     assert [len(axis.lines) for axis in (mic, chair)] == [2, 1]

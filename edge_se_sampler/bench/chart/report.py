@@ -122,10 +122,11 @@ def _failures(runs: list[Run]) -> str:
 
 
 def _cost_fields(runs: list[Run]) -> list[str]:
-    """Milliseconds and queries a step, and memory; not known of baselines."""
+    """Milliseconds and queries a step, and memory; not known of baselines, nor lean-nerf's queries."""
     if not all("queries" in run for run in runs):
         return ["–", "–", "–"]
     step = statistics.median(1000 * (run["seconds"] - run["ready_seconds"]) / run["steps"] for run in runs)
     queries = statistics.median(run["queries"] / run["steps"] for run in runs)
+    counted = f"{queries:,.0f}" if queries else "–"
     memory = statistics.median(run["peak_bytes"] for run in runs) / 2**20
-    return [f"{step:.1f}", f"{queries:,.0f}", f"{memory:,.0f} MiB"]
+    return [f"{step:.1f}", counted, f"{memory:,.0f} MiB"]

@@ -1,4 +1,5 @@
-"""One training of the chart: test PSNR after seconds of training, under a plan that fills the time that it has.
+"""One trial of the chart: test PSNR after seconds of training, under a plan that fills the time that it has. lean-nerf,
+which can be given a time budget, is trained anew for each budget.
 
 Training time runs from reading the data (scene analysis and tables included) to the end of a step; imports and
 evaluations are left out. Trainings on one thread are timed in CPU seconds, which other work on the machine hardly
@@ -14,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +31,13 @@ from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 
 EVAL_SECONDS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)
 """Seconds of training after which the test views are evaluated."""
+BUDGETS = (3, 7, 20)
+"""Shorter trainings of models that follow a time budget, s: those of less than half of the whole time."""
 PROBE_STEPS = 12
 """Steps from the end of the plan, the slower ones, whose time tells how many will fit; the first quarter is warm-up."""
 PROBE_FRACTION = 1 / 30
@@ -85,12 +90,28 @@ def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run
         torch.set_num_threads(settings.threads)
         memory_before = resident_memory()
         config = config_of(trial, data, Path(folder))
-        run = _train(config, iterations_within(config, settings), settings)
-        ready = run["ready_seconds"]
-        fitting = max(1, round(run["steps"] * (settings.seconds - ready) / (run["seconds"] - ready)))
-        if abs(1 - run["planned_steps"] / fitting) > MAX_PLAN_ERROR:
-            run = _train(config, fitting, settings)
+        follows_budget = isinstance(config.pipeline.model, LeanModelConfig)
+        run = (_train_budgets if follows_budget else _train_planned)(config, settings)
         return {**run, "peak_bytes": max(0, resident_memory("VmHWM") - memory_before)}
+
+
+def _train_budgets(config: TrainerConfig, settings: ChartSettings) -> Run:
+    """The longest training; its curve has the ends of the shorter ones before its own."""
+    ends, run = [], {}
+    for budget in (*(budget for budget in BUDGETS if 2 * budget < settings.seconds), settings.seconds):
+        run = _train(replace(config, time_budget=str(budget)), settings)
+        ends.append(run["curve"][-1])
+    return {**run, "curve": ends}
+
+
+def _train_planned(config: TrainerConfig, settings: ChartSettings) -> Run:
+    """With as many iterations as fit."""
+    run = _train(replace(config, max_num_iterations=iterations_within(config, settings)), settings)
+    ready = run["ready_seconds"]
+    fitting = max(1, round(run["steps"] * (settings.seconds - ready) / (run["seconds"] - ready)))
+    if abs(1 - run["planned_steps"] / fitting) > MAX_PLAN_ERROR:
+        return _train(replace(config, max_num_iterations=fitting), settings)
+    return run
 
 
 def iterations_within(config: TrainerConfig, settings: ChartSettings) -> int:
@@ -110,20 +131,23 @@ def iterations_within(config: TrainerConfig, settings: ChartSettings) -> int:
     return max(PROBE_STEPS, round((settings.seconds - ready) / statistics.median(times[PROBE_STEPS // 4 :])))
 
 
-def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> Run:
+def _train(config: TrainerConfig, settings: ChartSettings) -> Run:
+    """A training of the iterations or of the time budget that the config has."""
     start = settings.clock()
-    trainer = prepare(replace(config, max_num_iterations=iterations, steps_per_eval_image=iterations))
+    trainer = prepare(config)
     ready = spent = round(settings.clock() - start, 3)
     model, pictures = trainer.pipeline.model, to_pictures(read_test_views(trainer.config))
     queries = count_queries(model)
-    due = [seconds for seconds in EVAL_SECONDS if ready < seconds < settings.seconds]
+    due = [] if config.time_budget else [seconds for seconds in EVAL_SECONDS if ready < seconds < settings.seconds]
     curve: list[list[float]] = []
     results: dict[str, Any] = {}
-    for steps in range(1, iterations + 1):
+    trainer.plan.decide(0, spent)
+    for steps in count(1):
         start = settings.clock()
         trainer.train_iteration(steps - 1)
         spent += settings.clock() - start
-        is_last = steps == iterations or spent >= settings.seconds
+        trainer.plan.decide(steps, spent)
+        is_last = steps == trainer.plan.num_steps or spent >= settings.seconds
         if is_last or (due and spent >= due[0]):
             due = [seconds for seconds in due if seconds > spent]
             queries[:] = [sum(queries)]
@@ -133,7 +157,8 @@ def _train(config: TrainerConfig, iterations: int, settings: ChartSettings) -> R
         if is_last:
             break
     outcome = measure_outcome(results["images"], pictures, model.config.background_level)["outcome"]
-    run = {"planned_steps": iterations, "ready_seconds": ready, "psnr": results["psnr"], "outcome": outcome}
+    planned = trainer.plan.num_steps or curve[-1][1]
+    run = {"planned_steps": planned, "ready_seconds": ready, "psnr": results["psnr"], "outcome": outcome}
     return run | dict(zip(("seconds", "steps", "queries"), curve[-1], strict=False)) | {"curve": curve}
 
 
@@ -148,7 +173,8 @@ def quick_psnr(model: RayModel, pictures: list[Picture]) -> float:
 
 
 def count_queries(model: RayModel) -> list[int]:
-    """A list that grows by the number of points whenever one of the model's networks is evaluated."""
+    """A list that grows by the number of points whenever one of the model's networks is evaluated; not that of
+    lean-nerf, which its kernels evaluate."""
     counts: list[int] = []
     for network in model.networks:
         getattr(model, network).register_forward_hook(lambda _, inputs, __: counts.append(len(inputs[0])))
