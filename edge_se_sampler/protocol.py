@@ -102,6 +102,8 @@ class CallbackTrainer(Protocol):
     """Length of the run as first planned; resuming does not change it."""
     config: Any
     """The run's settings; `config.machine.seed` among them."""
+    optimizer: Any
+    """A torch.optim.Optimizer; what it remembers of a parameter means nothing once that has other rows."""
 
     def progress(self, step: int) -> float:
         """The part of the training, in [0, 1], that is done when a step begins."""

@@ -64,6 +64,20 @@ def show_all(model: LeanModel, times: int = 1) -> None:
     model.grid.num_seen.fill_(times * model.grid.num_rows)
 
 
+def test_what_the_optimizer_remembers_of_cells_ends_when_they_are_subdivided() -> None:
+    """Its rows are other cells' afterwards, even where there are as many."""
+    trainer = tiny_trainer(config_of(100), VIEWS)
+    model = trainer.pipeline.model
+    remembered = []
+    for step in range(30):
+        level = int(model.grid.level)
+        trainer.train_iteration(step)
+        if int(model.grid.level) > level:
+            remembered = [int(trainer.optimizer.state[weight]["step"]) for weight in (model.density, model.features)]
+    assert remembered == [1, 1]
+    assert int(trainer.optimizer.state[model.fine.hidden]["step"]) == 30
+
+
 def test_cells_without_weight_are_left_out_when_cells_are_subdivided() -> None:
     """All but those of one corner of the box, and the smaller ones next to them."""
     model = full_model()

@@ -244,6 +244,25 @@ def test_nothing_is_left_to_compile_when_the_clock_runs() -> None:
     subprocess.run([sys.executable, "-c", COMPILED], check=True, cwd=Path(__file__).parent)
 
 
+THREADS = """
+import torch
+torch.set_num_threads(1)
+from test_lean_model import config_of, steps_of, VIEWS
+from tiny import tiny_trainer
+trainer = tiny_trainer(config_of(30), VIEWS)
+steps_of(trainer, 2)
+import numba
+assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
+torch.set_num_threads(2)
+steps_of(trainer, 1, 2)
+assert (torch.get_num_threads(), numba.get_num_threads()) == (2, min(2, numba.config.NUMBA_NUM_THREADS))
+"""
+
+
+def test_kernels_use_as_many_threads_as_torch() -> None:
+    subprocess.run([sys.executable, "-c", THREADS], check=True, cwd=Path(__file__).parent)
+
+
 LOSSES = """
 import pytest
 from test_voxel_kernels import losses, voxel_kernels

@@ -147,9 +147,6 @@ class Trainer:
             message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
             tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
             self._record(step, reinitialized=network, sub_seed=sub_seed)
-        for weight, state in self.optimizer.state.items():
-            if state["exp_avg"].shape != weight.shape:  # a feature table that was resized
-                state.clear()
         self.optimizer.step()
         self.scheduler.step()
         self.pipeline.datamanager.observe(torch.cat(errors))

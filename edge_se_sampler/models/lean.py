@@ -69,8 +69,11 @@ def compiled_ops() -> ModuleType | None:
         hint = 'pip install "edge-se-sampler[fast]" makes this model much faster on a CPU'
         print(f"edge-se: numba is not installed; {hint}", file=sys.stderr)
         return None
+    num_threads = torch.get_num_threads()
     from edge_se_sampler.models import voxel_kernels
 
+    voxel_kernels.set_num_threads(num_threads)
+    torch.set_num_threads(num_threads)  # as numba begins it sets OpenMP's number, which is torch's too
     return voxel_kernels
 
 
@@ -205,20 +208,24 @@ class LeanModel(RayModel):
         def update_cells(step: int) -> None:
             if step % STEPS_PER_SAMPLED == 0:
                 self.update_sampled()
-            self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step))
+            if self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step)):
+                for parameter in (self.density, self.features):
+                    trainer.optimizer.state.pop(parameter, None)
 
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], update_cells)]
 
     @torch.no_grad()
-    def update_cells(self, before: float, now: float) -> None:
-        """Do what is due as training goes on from one part of it to the next, both in [0, 1]."""
+    def update_cells(self, before: float, now: float) -> bool:
+        """Do what is due as training goes on from one part of it to the next, both in [0, 1]; tells whether cells were
+        subdivided."""
         grid = self.grid
         begin, end = self._level_span()
         if before < begin + UNSETTLED * (end - begin) <= now:
             grid.reset_max_weight()
         # before that many weights are seen, nobody knows which cells are empty
         if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
-            self._subdivide()
+            return self._subdivide()
+        return False
 
     @torch.no_grad()
     def update_sampled(self) -> None:
@@ -239,20 +246,22 @@ class LeanModel(RayModel):
             raise FloatingPointError("no cell has anything in it any more; try a lower --optimizer.lr, or a longer run")
         return self.grid.to_cells(seen)
 
-    def _subdivide(self) -> None:
-        """Subdivide the cells that were seen, and those around them, as far as memory and what was seen allow."""
+    def _subdivide(self) -> bool:
+        """Subdivide the cells that were seen, and those around them, as far as memory and what was seen allow; False:
+        they do not at all."""
         grid = self.grid
         finer = self._find_finer(self._find_seen())
         if finer is None:
             grid.level += 1
             grid.reset_max_weight()
-            return
+            return False
         ratio = float(finer.cell_size / grid.cell_size)
         for parameter in (self.density, self.features):
             parameter.grad = None
             parameter.data = choose_ops(self.density).resample(finer.bricks, ratio, grid.numbers, parameter.data)
         self.grid = finer
         self.update_sampled()
+        return True
 
     def _find_finer(self, kept: Tensor) -> BrickGrid | None:
         """Those of the grid's cells that are kept, halved; at last smaller, if enough was seen for more rows; larger,
