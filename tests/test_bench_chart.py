@@ -156,10 +156,10 @@ def test_medians_over_seeds_then_means_over_scenes() -> None:
 def test_only_common_scenes_and_seeds_are_compared() -> None:
     runs = [run_of("lean", scene, 0, [(1, 20)]) for scene in ("mic", "chair")] + [run_of("edge", "mic", 0, [(1, 9)])]
     assert {run["scene"] for found in comparable(by_variant(runs)).values() for run in found} == {"mic"}
-    runs += [run_of("lean", "mic", 1, [(1, 20)]), run_of("rays-8192", "chair", 0, [(1, 20)])]
+    runs += [run_of("lean", "mic", 1, [(1, 20)]), run_of("no-alpha-loss", "chair", 0, [(1, 20)])]
     methods = comparable(by_variant(runs, ["methods"]))
     assert {name: [run["seed"] for run in found] for name, found in methods.items()} == {"lean": [0], "edge": [0]}
-    assert {run["scene"] for run in comparable(by_variant(runs, ["size"]))["lean"]} == {"chair"}
+    assert {run["scene"] for run in comparable(by_variant(runs, ["parts"]))["lean"]} == {"chair"}
     assert comparable(by_variant(runs)) == comparable({}) == {}  # nothing in common, or nothing at all
 
 
@@ -223,7 +223,7 @@ def test_curves_of_a_single_evaluation_are_drawn() -> None:
     np.testing.assert_array_equal(drawn[0].get_xydata(), [[3, 21.5]])
     labels = [text.get_text() for text in draw_scenes(runs, {}, ChartSettings(seconds=2)).legends[0].get_texts()]
     assert sorted(labels) == ["Edge", "lean-nerf"]  # once each, whatever the seeds
-    parts = [run_of("no-hull", "mic", 0, [(1, 20)], "collapsed"), run_of("rays-8192", "chair", 0, [(1, 22)])]
+    parts = [run_of("no-hull", "mic", 0, [(1, 20)], "collapsed"), run_of("no-alpha-loss", "chair", 0, [(1, 22)])]
     mic, chair = draw_scenes(parts, {}, ChartSettings(seconds=2)).axes[1::-1]
     assert [line.get_marker() for line in mic.lines] == ["None", "x"]
     assert [len(axis.lines) for axis in (mic, chair)] == [2, 1]

@@ -32,6 +32,7 @@ from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.lean import compile_ops
 from edge_se_sampler.models.ray_model import RayModel
 
 EVAL_SECONDS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)
@@ -97,6 +98,7 @@ def train_and_evaluate(trial: Trial, settings: ChartSettings, data: Path) -> Run
 
 def _train_budgets(config: TrainerConfig, settings: ChartSettings) -> Run:
     """The longest training; its curve has the ends of the shorter ones before its own."""
+    compile_ops("cpu")  # or load them: like imports
     ends, run = [], {}
     for budget in (*(budget for budget in BUDGETS if 2 * budget < settings.seconds), settings.seconds):
         run = _train(replace(config, time_budget=str(budget)), settings)

@@ -54,8 +54,6 @@ VARIANTS: dict[str, Variant] = {
     "lean-edge": Variant("pixels", "Edge first (adaptive schedule)", {f"{SAMPLER}.early": "edge", **ADAPTIVE}),
     "no-hull": Variant("parts", "no hull", {f"{MODEL}.cull_by_alpha": False}),
     "no-alpha-loss": Variant("parts", "no alpha loss", {f"{MODEL}.alpha_loss": 0.0}),
-    "no-total-variation": Variant("parts", "no total variation", {f"{MODEL}.total_variation": 0.0}),
     "two-networks": Variant("parts", "vanilla-nerf's two networks in the hull", IN_THE_HULL, "vanilla-nerf"),
-    "rays-8192": Variant("size", "8192 rays", {f"{MANAGER}.train_num_rays_per_batch": 8192}),
 }
 GROUPS = tuple(dict.fromkeys(variant.group for variant in VARIANTS.values()))
