@@ -36,7 +36,7 @@ def test_cheap_squared_errors_cost_hardly_more_than_random_on_the_papers_network
     assert max(memory["coarse"], memory["cached"]) <= 1.05
 
 
-@pytest.mark.parametrize(("seconds", "psnr"), [(3, 26), (7, 28), (20, 31), (60, 34)])
+@pytest.mark.parametrize(("seconds", "psnr"), [(3, 31), (7, 34), (20, 35), (60, 35)])
 def test_lean_nerf_on_one_core_reaches_these_psnrs(seconds: float, psnr: float):
     runs = [run for run in chart_runs("lean") if run["scene"] == "bricks"]
     assert sorted(run["seed"] for run in runs) == [0, 1, 2]
@@ -46,14 +46,17 @@ def test_lean_nerf_on_one_core_reaches_these_psnrs(seconds: float, psnr: float):
 def test_lean_nerf_is_good_on_every_scene():
     psnr = {run["scene"]: run["psnr"] for run in chart_runs("lean") if run["seed"] == 0}
     assert {*psnr} == {*SCENES}
-    assert statistics.mean(psnr.values()) >= 32
-    assert min(psnr.values()) >= 28.5
+    assert statistics.mean(psnr.values()) >= 34.5
+    assert min(psnr.values()) >= 31.5
 
 
-@pytest.mark.parametrize(("folder", "variant"), [("lean-ten-seeds", "lean"), ("lean-ten-seeds-no-hull", "no-hull")])
-def test_lean_nerf_fails_in_none_of_70_short_trainings(folder: str, variant: str):
+@pytest.mark.parametrize(
+    ("folder", "variant", "scenes"),
+    [("lean-ten-seeds", "lean", SCENES), ("lean-ten-seeds-no-hull", "no-hull", ("bricks", "drums", "mic"))],
+)
+def test_lean_nerf_fails_in_no_short_training(folder: str, variant: str, scenes: tuple[str, ...]):
     runs = chart_runs(variant, folder)
-    assert {(run["scene"], run["seed"]) for run in runs} == set(product(SCENES, range(10)))
+    assert {(run["scene"], run["seed"]) for run in runs} == set(product(scenes, range(10)))
     assert {run["outcome"] for run in runs} == {"converged"}
 
 
