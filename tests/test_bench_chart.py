@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,10 @@ def test_peak_memory_is_the_trainings_alone(data: Path) -> None:
 
 @pytest.fixture
 def ticks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that every look at it moves on by 10 ms: a step takes 10 ms."""
+    """A clock that every look at it moves on by 10 ms: a step takes 10 ms. "edge" has few rays a step."""
     count = itertools.count()
+    few = {"pipeline.datamanager.train_num_rays_per_batch": 4}
+    monkeypatch.setitem(VARIANTS, "edge", replace(VARIANTS["edge"], changes=few))
     monkeypatch.setattr(ChartSettings, "clock", lambda _: 0.01 * next(count))
 
 
