@@ -89,10 +89,13 @@ class TrainingCallbackLocation(Enum):
 
 
 class CallbackPipeline(Protocol):
-    """The part of a pipeline that callbacks use: the model being trained."""
+    """The part of a pipeline that callbacks use: the model being trained, and what draws its pixels."""
 
     @property
     def model(self) -> Any: ...
+
+    @property
+    def datamanager(self) -> Any: ...
 
 
 class CallbackTrainer(Protocol):

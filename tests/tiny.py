@@ -66,9 +66,8 @@ def tiny_rays(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> 
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     norm = torch.from_numpy(rng.uniform(1, 1.2, (count, 1))).to(dtype)
     numbers = torch.zeros((count, 1), dtype=torch.int64)
-    return RayBundle(
-        torch.from_numpy(origins).to(dtype), torch.from_numpy(directions).to(dtype), numbers, {"directions_norm": norm}
-    )
+    metadata = {"directions_norm": norm, "pixel_axes": torch.from_numpy(rng.normal(size=(count, 2, 3)) / 50).to(dtype)}
+    return RayBundle(torch.from_numpy(origins).to(dtype), torch.from_numpy(directions).to(dtype), numbers, metadata)
 
 
 def with_constant_density(model: NeRFModel, raw: float) -> NeRFModel:

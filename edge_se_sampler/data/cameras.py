@@ -19,7 +19,9 @@ class RayBundle:
     origins: Tensor  # (n, 3) world units
     directions: Tensor  # (n, 3) unit vectors
     camera_indices: Tensor  # (n, 1) int64
-    metadata: dict[str, Tensor]  # "directions_norm" (n, 1): length of the direction whose depth along the axis is 1
+    metadata: dict[str, Tensor]
+    """"directions_norm" (n, 1): length of the direction whose depth along the optical axis is 1; "pixel_axes" (n, 2, 3):
+    what that changes by from a pixel to the one below, and to the one on the right."""
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -27,6 +29,15 @@ class RayBundle:
     def __getitem__(self, rows: slice) -> RayBundle:
         metadata = {key: value[rows] for key, value in self.metadata.items()}
         return RayBundle(self.origins[rows], self.directions[rows], self.camera_indices[rows], metadata)
+
+    def split_pixels(self) -> RayBundle:
+        """4 n rays: each ray replaced by those through the centers of its pixel's quarters."""
+        quarters = torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]]).to(self.directions) / 4
+        center = self.directions * self.metadata["directions_norm"]
+        directions = (center[:, None] + quarters @ self.metadata["pixel_axes"]).reshape(-1, 3)
+        norm = directions.norm(dim=1, keepdim=True)
+        origins, camera_indices = (x.repeat_interleave(4, dim=0) for x in (self.origins, self.camera_indices))
+        return RayBundle(origins, directions / norm, camera_indices, {"directions_norm": norm})
 
 
 @dataclass(frozen=True)
@@ -89,7 +100,9 @@ class Cameras:
         pose = self.camera_to_worlds[c]
         directions = (pose[:, :, :3] @ in_camera[:, :, None])[:, :, 0]
         norm = directions.norm(dim=1, keepdim=True)
-        return RayBundle(pose[:, :, 3], directions / norm, camera_indices, {"directions_norm": norm})
+        pixel_axes = torch.stack((-pose[:, :, 1] / self.fy[c], pose[:, :, 0] / self.fx[c]), dim=1)
+        metadata = {"directions_norm": norm, "pixel_axes": pixel_axes}
+        return RayBundle(pose[:, :, 3], directions / norm, camera_indices, metadata)
 
     def pixel_rays(self, pixels: Tensor) -> RayBundle:
         """Rays through the centers of pixels: (n, 3) int64 camera, row, column -> n rays."""

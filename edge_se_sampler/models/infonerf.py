@@ -53,8 +53,9 @@ def rotation_matrix(angles: Tensor) -> Tensor:
 
 def rotate_rays(rays: RayBundle, rotation: Tensor) -> RayBundle:
     """The rays rotated about the world's origin by a (3, 3) matrix."""
-    rotation = rotation.to(rays.origins)
-    return RayBundle(rays.origins @ rotation.T, rays.directions @ rotation.T, rays.camera_indices, rays.metadata)
+    turned = rotation.to(rays.origins).T
+    metadata = rays.metadata | {"pixel_axes": rays.metadata["pixel_axes"] @ turned}
+    return RayBundle(rays.origins @ turned, rays.directions @ turned, rays.camera_indices, metadata)
 
 
 class InfoNeRFModel(NeRFModel):

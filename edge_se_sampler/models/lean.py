@@ -36,14 +36,20 @@ INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
 """Denser than the maximum is as opaque, and slow to become transparent again."""
 LAST_SUBDIVISION, LEVEL_RATIO = 0.45, 0.45
 """Part of the training after which the finest level begins, and by which each level ends before the next one does."""
+MAX_VISITS = 3.5
+"""Cells are subdivided as if the training would end when each pixel has been trained on so often: the larger ones learn
+no more by then."""
 UNSETTLED = 0.4
 """Part of a level whose weights are not looked at when cells are pruned: they still move."""
+SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
+"""Part of the training after which a pixel has 2 x 2 rays, and how often all of them must have been trained on before:
+more rays tell more of what is smaller than a pixel, but other pixels tell more of what is not yet known."""
 STEPS_PER_SAMPLED = 50
 """Steps after which cells that have become transparent are found again."""
 TRANSPARENT_MARGIN = 0.7
 """How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
-ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.25, 1.5
-"""Rows that there may be, once cells are smaller than was planned, for each weight that was seen before, and for each
+ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.2, 1.5
+"""Rows that there may be, once cells are smaller than was planned, for each weight that will be seen, and for each
 pixel of the training images that shows something: what is hardly seen is not learned any better in smaller cells, and
 with more numbers than there are in the images the model remembers rather than learns."""
 MAX_RATIO = 0.8
@@ -121,6 +127,8 @@ class LeanModel(RayModel):
 
     config: LeanModelConfig
     grid: BrickGrid
+    supersampled: Tensor
+    """() bool: whether a pixel's color is the mean over 2 x 2 rays through it, rather than that of one."""
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
@@ -131,6 +139,7 @@ class LeanModel(RayModel):
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
         draws = rng.standard_normal((grid.num_rows, FEATURE_DIM), dtype=np.float32) * np.float32(0.01)
         self.features = nn.Parameter(torch.from_numpy(draws))
+        self.register_buffer("supersampled", torch.tensor(False))
 
     @property
     def marching(self) -> Marching:
@@ -174,13 +183,16 @@ class LeanModel(RayModel):
 
     def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
         """Outputs of `forward`, and what they were made of."""
-        spans, jitter = self._spans(rays), self.uniform(len(rays), 1)[:, 0] if self.training else None
+        split = rays.split_pixels() if self.supersampled else rays
+        spans, jitter = self._spans(split), self.uniform(len(split), 1)[:, 0] if self.training else None
         weights = self.density, self.features, self.fine.weights()
         rendered = choose_ops(self.density).render(self.grid, *weights, spans, jitter, self.marching)
-        background, passing = self.get_background(rays), 1 - rendered.accumulation
-        outputs = {"rgb_fine": rendered.rgb + passing * background, "accumulation_fine": rendered.accumulation}
+        of_rays = rendered.rgb, rendered.accumulation, rendered.distance
+        rgb, accumulation, distance = (x.reshape(len(rays), -1, x.shape[1]).mean(dim=1) for x in of_rays)
+        background, passing = self.get_background(rays), 1 - accumulation
+        outputs = {"rgb_fine": rgb + passing * background, "accumulation_fine": accumulation}
         if not self.training:
-            depth = rendered.distance * float(self.grid.cell_size)
+            depth = distance * float(self.grid.cell_size)
             outputs["depth_fine"] = depth + passing * self.config.far * rays.metadata["directions_norm"]
         return outputs | {"background": background}, rendered
 
@@ -202,29 +214,41 @@ class LeanModel(RayModel):
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Prunes and subdivides cells, by the part of the training that is done; now and then finds those that have
-        become transparent."""
-        trainer = attributes.trainer
+        become transparent. At last replaces three of four pixels of a step by more rays through the others."""
+        trainer, sampler = attributes.trainer, attributes.pipeline.datamanager.train_pixel_sampler
+        num_rays = trainer.config.preset.rays
+
+        def visits(step: int) -> float:
+            return step * num_rays / max(int(self.grid.num_pixels), 1)
+
+        def update_rays(step: int) -> None:
+            if trainer.progress(step) >= SUPERSAMPLING_START and visits(step) >= MIN_VISITS:
+                self.supersampled.fill_(True)
+            if self.supersampled:
+                sampler.set_num_rays_per_batch(max(1, num_rays // 4))
 
         def update_cells(step: int) -> None:
             if step % STEPS_PER_SAMPLED == 0:
                 self.update_sampled()
-            if self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step)):
+            before, now = (max(trainer.progress(i), visits(i) / MAX_VISITS) for i in (max(step - 1, 0), step))
+            if self.update_cells(before, now, trainer.progress(step)):
                 for parameter in (self.density, self.features):
                     trainer.optimizer.state.pop(parameter, None)
 
-        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], update_cells)]
+        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+        return [TrainingCallback(before, update) for update in (update_rays, update_cells)]
 
     @torch.no_grad()
-    def update_cells(self, before: float, now: float) -> bool:
-        """Do what is due as training goes on from one part of it to the next, both in [0, 1]; tells whether cells were
-        subdivided."""
+    def update_cells(self, before: float, now: float, done: float) -> bool:
+        """Do what is due as cells go on from one part of their training to the next, when a part `done`, in (0, 1), of
+        the whole training is behind them; tells whether they were subdivided."""
         grid = self.grid
         begin, end = self._level_span()
         if before < begin + UNSETTLED * (end - begin) <= now:
             grid.reset_max_weight()
         # before that many weights are seen, nobody knows which cells are empty
         if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
-            return self._subdivide()
+            return self._subdivide((1 - done) / done)
         return False
 
     @torch.no_grad()
@@ -234,7 +258,7 @@ class LeanModel(RayModel):
         self.grid.set_sampled(choose_ops(self.density).find_dense_cells(self.grid, self.density, least))
 
     def _level_span(self) -> tuple[float, float]:
-        """Parts of the training at which the grid's level begins and ends."""
+        """Parts of the cells' training at which the grid's level begins and ends."""
         remaining = int(self.grid.max_level - self.grid.level)
         begin, end = (LAST_SUBDIVISION * LEVEL_RATIO ** (levels - 1) for levels in (remaining + 1, remaining))
         return begin if self.grid.level else 0.0, end if remaining else 1.0
@@ -246,11 +270,15 @@ class LeanModel(RayModel):
             raise FloatingPointError("no cell has anything in it any more; try a lower --optimizer.lr, or a longer run")
         return self.grid.to_cells(seen)
 
-    def _subdivide(self) -> bool:
-        """Subdivide the cells that were seen, and those around them, as far as memory and what was seen allow; False:
-        they do not at all."""
+    def _subdivide(self, remaining: float) -> bool:
+        """Subdivide the cells that were seen, and those around them, as far as memory and what will be seen allow;
+        False: they do not at all.
+
+        Args:
+            remaining: how much longer than until now the training goes on.
+        """
         grid = self.grid
-        finer = self._find_finer(self._find_seen())
+        finer = self._find_finer(self._find_seen(), remaining)
         if finer is None:
             grid.level += 1
             grid.reset_max_weight()
@@ -263,14 +291,15 @@ class LeanModel(RayModel):
         self.update_sampled()
         return True
 
-    def _find_finer(self, kept: Tensor) -> BrickGrid | None:
-        """Those of the grid's cells that are kept, halved; at last smaller, if enough was seen for more rows; larger,
-        if memory is too little. None: it is too little even for cells that are worth subdividing."""
+    def _find_finer(self, kept: Tensor, remaining: float) -> BrickGrid | None:
+        """Those of the grid's cells that are kept, halved; at last smaller, if enough will be seen for more rows;
+        larger, if memory is too little. None: it is too little even for cells that are worth subdividing."""
         grid, ratio = self.grid, 0.5
         assert self.config.max_memory is not None  # the config is resolved
         finer = grid.subdivide(kept, float(grid.cell_size) / 2)
         last = grid.level + 1 == grid.max_level
-        learnable = min(ROWS_PER_SEEN * int(grid.num_seen), ROWS_PER_PIXEL * int(grid.num_pixels)) if last else 0
+        will_be_seen = remaining * int(grid.num_seen)
+        learnable = min(ROWS_PER_SEEN * will_be_seen, ROWS_PER_PIXEL * int(grid.num_pixels)) if last else 0
         wanted = min(max(finer.num_rows, learnable), self.config.max_memory * 2**30 / BYTES_PER_ROW)
         for _ in range(4):
             better = max(ratio * (finer.num_rows / wanted) ** 0.4, 0.25)  # surfaces are layers of some cells
