@@ -89,23 +89,19 @@ def test_directions_norm_turns_depth_into_distance_along_the_ray() -> None:
 
 
 def test_a_pixels_quarters_are_where_opencv_sees_them() -> None:
+    quarters = np.array([[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]])
     cameras = some_cameras()
     for camera, (rows, columns) in enumerate(SIZES):
         rays = cameras.image_rays(camera)
         split = rays.split_pixels()
-        norm = split.metadata["directions_norm"].numpy()
-        seen = project(
-            cameras, camera, (split.origins + 3 * split.metadata["directions_norm"] * split.directions).numpy()
-        )
-        row, column = np.divmod(np.arange(rows * columns), columns)
-        corner = np.stack((row, column), axis=1)[:, None] + np.array(
-            [[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]]
-        )
-        np.testing.assert_allclose(seen[:, :2], corner.reshape(-1, 2), atol=1e-9)
-        np.testing.assert_allclose(seen[:, 2], 3, rtol=1e-9)
-        np.testing.assert_allclose(np.linalg.norm(split.directions, axis=1), 1, rtol=1e-12)
-        assert norm.shape == (4 * len(rays), 1)
+        assert len(split) == 4 * len(rays)
         assert torch.equal(split.camera_indices, rays.camera_indices.repeat_interleave(4, dim=0))
+        np.testing.assert_allclose(split.directions.norm(dim=1), 1, rtol=1e-12)
+        points = split.origins + 3 * split.metadata["directions_norm"] * split.directions
+        seen = project(cameras, camera, points.numpy())
+        corner = np.stack(np.divmod(np.arange(rows * columns), columns), axis=1)
+        np.testing.assert_allclose(seen[:, :2], (corner[:, None] + quarters).reshape(-1, 2), atol=1e-9)
+        np.testing.assert_allclose(seen[:, 2], 3, rtol=1e-9)
 
 
 def test_projection_is_the_inverse_of_rays() -> None:

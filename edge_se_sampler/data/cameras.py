@@ -20,8 +20,8 @@ class RayBundle:
     directions: Tensor  # (n, 3) unit vectors
     camera_indices: Tensor  # (n, 1) int64
     metadata: dict[str, Tensor]
-    """"directions_norm" (n, 1): length of the direction whose depth along the optical axis is 1; "pixel_axes" (n, 2, 3):
-    what that changes by from a pixel to the one below, and to the one on the right."""
+    """"directions_norm" (n, 1): length of the direction whose depth along the axis is 1; "pixel_axes" (n, 2, 3): what
+    that changes by from a pixel to the one below, and to the one on the right."""
 
     def __len__(self) -> int:
         return len(self.origins)
