@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -25,8 +26,8 @@ def downscale(views: Views, factor: int) -> Views:
         images = tuple(pool.map(partial(average_pixels, factor=factor), views.images))
     masks = None
     if views.masks is not None:
-        masks = tuple(np.asarray(_blocks(mask, factor).all(axis=(1, 3))) for mask in views.masks)
-    return Views(views.names, images, masks, views.cameras.downscale(factor))
+        masks = tuple(shrink_mask(mask, factor) for mask in views.masks)
+    return replace(views, images=images, masks=masks, cameras=views.cameras.downscale(factor))
 
 
 def average_pixels(image: np.ndarray, factor: int) -> np.ndarray:
@@ -38,6 +39,11 @@ def average_pixels(image: np.ndarray, factor: int) -> np.ndarray:
     alpha = _blocks(alpha, factor).mean(axis=(1, 3))
     color = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
     return np.rint(np.concatenate((color, alpha), axis=2)).astype(np.uint8)
+
+
+def shrink_mask(mask: np.ndarray, factor: int) -> np.ndarray:
+    """(H, W) bool -> (H // factor, W // factor) bool: where all are True."""
+    return np.asarray(_blocks(mask, factor).all(axis=(1, 3)))
 
 
 def _blocks(values: np.ndarray, factor: int) -> np.ndarray:
