@@ -5,16 +5,12 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
 
+from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.frames import LoadSettings, Progress, load_views
 from edge_se_sampler.data.scene_file import SourceLocation, check_folder, read_json
 from edge_se_sampler.data.transforms_frames import read_entries, read_frames
 from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, Views
-
-Split = Literal["train", "val", "test"]
-SPLITS: tuple[Split, ...] = get_args(Split)
-
 
 def transforms_path(folder: Path, split: str) -> Path:
     return folder / f"transforms_{split}.json"

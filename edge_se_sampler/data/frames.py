@@ -5,25 +5,23 @@ No image but those at work is in memory at its full size.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.config import Masks
 from edge_se_sampler.data.downscale import average_pixels, shrink_mask
 from edge_se_sampler.data.image_file import ImageHeader, read_header, read_image, turn_upright
-from edge_se_sampler.data.lens import Intrinsics, find_sources, undistort
+from edge_se_sampler.data.lens import Intrinsics, find_pinhole, find_sources, undistort
 from edge_se_sampler.data.memory import check_memory, num_workers
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
-Masks = Literal["ignore", "object"]
 Progress = Callable[[int, int], None]
 """Is told how many of how many images are read."""
 MAX_REMAPPED = 2**15 - 2
@@ -44,6 +42,11 @@ class Frame:
     """Its image's; turned upright, where that is to be done."""
     camera: Intrinsics
     """Of the image of that size."""
+
+    @property
+    def pinhole(self) -> Intrinsics:
+        """Of the image once its lens is undone."""
+        return find_pinhole(self.camera, self.header.width, self.header.height)
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def choose_orientation(file: SourceFile, header: ImageHeader, matches: Callable[
 
 def load_views(
     frames: Sequence[Frame],
-    settings: LoadSettings = LoadSettings(),  # noqa: B008 (frozen)
+    settings: LoadSettings = LoadSettings(),
     progress: Progress = lambda done, total: None,
 ) -> Views:
     """Decode the images of at least one frame. InputError for images and masks that cannot be used, for a mask of
@@ -132,7 +135,7 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
         alpha = np.minimum(mask, image[..., 3]) if image.shape[2] == 4 else mask
         image, mask = np.concatenate((image[..., :3], alpha[..., None]), axis=2), None
     if frame.camera.lens is not None:
-        sources, inside = find_sources(frame.camera, image.shape[1], image.shape[0])
+        sources, inside = find_sources(frame.camera, frame.pinhole, frame.header.width, frame.header.height)
         if not inside.any():
             raise frame.image.error("shows nothing once its lens is undone", "correct the distortion coefficients")
         image = undistort(image, sources, inside)
@@ -158,7 +161,7 @@ def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
 
 
 def _cameras(frames: Sequence[Frame], downscale: int) -> Cameras:
-    intrinsics = {key: [getattr(frame.camera, key) for frame in frames] for key in ("fx", "fy", "cx", "cy")}
+    intrinsics = {key: [getattr(frame.pinhole, key) for frame in frames] for key in ("fx", "fy", "cx", "cy")}
     width, height = np.array([(frame.header.width, frame.header.height) for frame in frames]).T
     cameras = Cameras.of([frame.pose for frame in frames], **intrinsics, width=width, height=height)
     return cameras if downscale == 1 else cameras.downscale(downscale)

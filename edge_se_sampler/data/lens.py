@@ -1,4 +1,4 @@
-"""Lens distortion, undone by OpenCV: what a pinhole camera of the same focal lengths would have seen.
+"""Lens distortion, undone: what a pinhole camera of the same focal lengths would have seen.
 
 x, y   of an undistorted point in the camera: right / depth, down / depth
 r      their length; theta = atan(r)
@@ -9,13 +9,17 @@ fisheye:       x theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) /
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
 NUM_RADII = 2000
 """At which a polynomial is looked at for where it turns back."""
+MIN_ZOOM, MAX_ZOOM = 0.5, 2.0
+"""Of a pinhole's focal lengths, in those of the lens whose image it shows."""
 
 
 @dataclass(frozen=True)
@@ -44,24 +48,73 @@ class Intrinsics:
         return Intrinsics(x * self.fx, y * self.fy, x * self.cx, y * self.cy, self.lens)
 
 
-def find_sources(camera: Intrinsics, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the image of a camera with a lens shows what a pinhole would show at each pixel of an image of that size.
+@lru_cache
+def find_pinhole(camera: Intrinsics, width: int, height: int) -> Intrinsics:
+    """The pinhole whose image of the same size shows as much of a lens's as can be without showing what lies outside:
+    focal lengths between half and twice the lens's. Where that cannot be (a principal point outside, a polynomial that
+    turns back at once), they stay. A pinhole is returned as it is."""
+    if camera.lens is None:
+        return camera
+    across, down = np.linspace(0, width - 1, 65), np.linspace(0, height - 1, 65)
+    edges = [(across, np.full(65, y)) for y in (0.0, height - 1.0)] + [
+        (np.full(65, x), down) for x in (0.0, width - 1.0)
+    ]
+    x, y = np.concatenate(edges, axis=1)
+    low, high = MIN_ZOOM, MAX_ZOOM
+    if not _all_inside(camera, _zoom(camera, high), width, height, x, y):
+        return _zoom(camera, 1.0)
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (low, middle) if _all_inside(camera, _zoom(camera, middle), width, height, x, y) else (middle, high)
+    return _zoom(camera, high)
+
+
+def _zoom(camera: Intrinsics, factor: float) -> Intrinsics:
+    return Intrinsics(factor * camera.fx, factor * camera.fy, camera.cx, camera.cy)
+
+
+def _all_inside(camera: Intrinsics, pinhole: Intrinsics, width: int, height: int, x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether the image of a lens shows what a pinhole shows at pixels x, y (m,)."""
+    return bool(_locate(camera, pinhole, width, height, x[None], y[None])[1].all())
+
+
+def find_sources(camera: Intrinsics, pinhole: Intrinsics, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the image of a camera with a lens shows what a pinhole shows at each pixel; both images are of that size.
 
     Returns:
         x, y (2, H, W) float32 in OpenCV's pixels, whose centers are whole numbers; (H, W) bool: whether that is in the
         image and shown nowhere else.
     """
+    return _locate(camera, pinhole, width, height, np.arange(width)[None], np.arange(height)[:, None])
+
+
+def _locate(
+    camera: Intrinsics, pinhole: Intrinsics, width: int, height: int, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`find_sources` at pixels x, y, which broadcast to (H, W)."""
     assert camera.lens is not None
-    coefficients, size = np.array(camera.lens.coefficients), (width, height)
-    matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
-    find = cv2.fisheye.initUndistortRectifyMap if camera.lens.fisheye else cv2.initUndistortRectifyMap
+    k = camera.lens.coefficients
     with np.errstate(all="ignore"):  # absurd coefficients overflow: no pixel is left then
-        x, y = find(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
-        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-        u, v = (np.arange(width) - matrix[0, 2]) / camera.fx, (np.arange(height) - matrix[1, 2]) / camera.fy
-        r = np.hypot(u, v[:, None])
-        inside &= r <= _largest_radius(camera.lens, float(r.max()))
-    return np.stack((x, y)), inside
+        u, v = np.broadcast_arrays((x + 0.5 - pinhole.cx) / pinhole.fx, (y + 0.5 - pinhole.cy) / pinhole.fy)
+        square = u * u + v * v
+        if camera.lens.fisheye:
+            r = np.sqrt(square)
+            angle = np.arctan(r)
+            factor = np.divide(angle, r, out=np.ones_like(r), where=r > 0) * _polynomial(k, angle * angle)
+            shown_u, shown_v = factor * u, factor * v
+        else:
+            factor = _polynomial((k[0], k[1], k[4]), square)
+            shown_u = factor * u + 2 * k[2] * u * v + k[3] * (square + 2 * u * u)
+            shown_v = factor * v + k[2] * (square + 2 * v * v) + 2 * k[3] * u * v
+        shown_x, shown_y = camera.fx * shown_u + camera.cx - 0.5, camera.fy * shown_v + camera.cy - 0.5
+        inside = (shown_x >= -0.5) & (shown_x <= width - 0.5) & (shown_y >= -0.5) & (shown_y <= height - 0.5)
+        inside &= square <= _largest_radius(camera.lens, float(np.sqrt(square.max()))) ** 2
+        return np.stack((shown_x, shown_y)).astype(np.float32), inside
+
+
+def _polynomial(k: Sequence[float], square: np.ndarray) -> np.ndarray:
+    """1 + k_1 s + k_2 s^2 + ..."""
+    return 1 + square * sum((k[i] * square**i for i in range(1, len(k))), k[0])
 
 
 def _largest_radius(lens: Lens, largest: float) -> float:
@@ -71,7 +124,7 @@ def _largest_radius(lens: Lens, largest: float) -> float:
         angle, k = np.arctan(r), lens.coefficients
     else:
         angle, k = r, (*lens.coefficients[:2], lens.coefficients[4])
-    shown = angle * (1 + sum(k[i] * angle ** (2 * i + 2) for i in range(len(k))))
+    shown = angle * _polynomial(k, angle * angle)
     turns = np.flatnonzero(~(np.diff(shown) > 0))
     return float(r[turns[0]]) if len(turns) else largest
 

@@ -24,7 +24,8 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.blender import SPLITS, Split, has_split, read_blender, transforms_path
+from edge_se_sampler.data.blender import has_split, read_blender, transforms_path
+from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
 from edge_se_sampler.data.transforms_frames import listed_file, read_entries, read_lens

@@ -90,7 +90,7 @@ def check_folder(folder: Path) -> None:
 
 
 def locate_file(folder: Path, listed: str, location: SourceLocation) -> SourceFile:
-    """The file that `location` lists, relative to `folder`; InputError if that lies outside it, be it through a link."""
+    """The file that is listed, relative to `folder`; InputError if that lies outside it, be it through a link."""
     if os.path.isabs(listed):
         raise location.error(f"{quote(listed)} is an absolute path", "write it relative to the folder")
     file = SourceFile(Path(os.path.realpath(folder / listed)), location, listed)

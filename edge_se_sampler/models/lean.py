@@ -181,7 +181,7 @@ class LeanModel(RayModel):
         outputs = {"rgb_fine": rendered.rgb + passing * background, "accumulation_fine": rendered.accumulation}
         if not self.training:
             depth = rendered.distance * float(self.grid.cell_size)
-            outputs["depth_fine"] = depth + passing * self.config.far * rays.metadata["directions_norm"]
+            outputs["depth_fine"] = depth + passing * self.config.depths[1] * rays.metadata["directions_norm"]
         return outputs | {"background": background}, rendered
 
     def _spans(self, rays: RayBundle) -> RaySpans:
@@ -196,8 +196,8 @@ class LeanModel(RayModel):
         return RaySpans(
             origins,
             rays.directions,
-            torch.maximum(begin, self.config.near * norm),
-            torch.minimum(end, self.config.far * norm),
+            torch.maximum(begin, near * norm),
+            torch.minimum(end, far * norm),
         )
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
