@@ -12,6 +12,7 @@ from edge_se_sampler.data.scene_file import SourceLocation, check_folder, read_j
 from edge_se_sampler.data.transforms_frames import read_entries, read_frames
 from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, Views
 
+
 def transforms_path(folder: Path, split: str) -> Path:
     return folder / f"transforms_{split}.json"
 

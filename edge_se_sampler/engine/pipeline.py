@@ -12,9 +12,10 @@ from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import ModelConfig
+from edge_se_sampler.models.config import Model, ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.depths import find_depths
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -59,6 +60,16 @@ def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
     """`analyze_scene` with a model's settings."""
     size_px, by_alpha = config.voxel_size_px, config.culls_by_alpha
     return analyze_scene(views, *config.depths, voxel_size_px=size_px, by_alpha=by_alpha)
+
+
+def resolve_depths(views: Views, config: Model) -> tuple[Model, str]:
+    """The config with near and far, where they are left out, from the training views, and what told them."""
+    if config.near is not None and config.far is not None:
+        return config, "as set"
+    found = find_depths(views)
+    near = found.near if config.near is None else config.near
+    far = found.far if config.far is None else config.far
+    return replace(config, near=near, far=far), found.source
 
 
 def build_model(config: TrainerConfig, device: str, grid: BrickGrid | None = None) -> RayModel:

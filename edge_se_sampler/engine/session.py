@@ -18,7 +18,7 @@ from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
+from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, resolve_depths, saved_grid
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
@@ -53,13 +53,14 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     whatever the views. InputError if a value is out of its range."""
     config.check_plan()
     data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
+    model, _ = resolve_depths(views, model)
     config = replace(config, pipeline=replace(config.pipeline, model=model))
     preset, by_steps = config.preset, config.time_budget is None and config.segments is None
     resolved = replace(
         config,
         data=data,
-        data_format=views.data_format or config.data_format,
-        eval_every=views.eval_every,
+        data_format=(views.data_format or "auto") if config.data_format == "auto" else config.data_format,
+        eval_every=config.eval_every or views.eval_every,
         experiment_name=config.experiment_name or (data.name if data else "unnamed"),
         max_num_iterations=preset.iterations if by_steps else None,
         steps_per_eval_image=config.preview_interval if by_steps else config.steps_per_eval_image,
@@ -152,6 +153,7 @@ def describe_run(trainer: Trainer) -> str:
     lines = [
         f"run      {trainer.run.path}",
         f"data     {trainer.pipeline.data_summary}",
+        f"depths   {model.near:g} to {model.far:g}",
         f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
         f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",
     ]

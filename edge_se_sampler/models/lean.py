@@ -191,6 +191,7 @@ class LeanModel(RayModel):
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
         norm = rays.metadata["directions_norm"][:, 0] / float(cell_size)
+        near, far = self.config.depths
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
         return RaySpans(
