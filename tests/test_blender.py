@@ -27,7 +27,6 @@ from blender_folder import (
 )
 
 from edge_se_sampler.data.blender import has_split, read_blender
-from edge_se_sampler.errors import InputError
 
 
 @pytest.fixture

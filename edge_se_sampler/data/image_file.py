@@ -44,7 +44,7 @@ def read_header(file: SourceFile) -> ImageHeader:
     try:
         file.check_regular()
         with file.path.open("rb") as stream, iio.imopen(stream, "r", plugin="pillow") as opened:
-            metadata = opened.metadata(index=0)
+            metadata = opened.metadata(index=0, exclude_applied=False)
         (width, height), orientation = metadata["shape"], metadata.get("Orientation", 1)
         channels = 4 if "transparency" in metadata or _MODES.get(metadata["mode"]) == "RGBA" else 3
     except Exception:  # decoding says what is wrong

@@ -76,7 +76,7 @@ class TrainerConfig(InstantiateConfig):
     """What mask files mean. ignore: what is outside is unknown, and not trained on; object: it is background, as if
     the mask were the image's alpha."""
     eval_every: int | None = None
-    """Hold out every EVAL_EVERY-th image in the order of names, where the data has no split of its own; by default 8."""
+    """Hold out every EVAL_EVERY-th image in the order of names, where the data has no split; by default 8."""
     num_views: int | None = None
     """Train on this many of the views, selected as InfoNeRF's code does; by default on all."""
     views: tuple[int, ...] | None = None

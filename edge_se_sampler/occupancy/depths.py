@@ -23,7 +23,7 @@ POINT_MARGIN = 0.1
 """By which the scene may reach beyond its points, as a share of their depth."""
 HULL_RESOLUTION = 64
 """Cells along the cube that silhouettes carve; it reaches from the focus to the middle camera."""
-MIN_SEEN = 0.5
+MIN_SEEN = 0.9
 """Share of the views that see a cell of the object, of the most that see any: the others are too few to carve what only
 they see."""
 CAMERA_FACTORS = 0.1, 2.0
