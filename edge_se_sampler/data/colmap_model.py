@@ -6,7 +6,7 @@ Every count is compared with the bytes that are left before memory is asked for.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from edge_se_sampler.data.lens import Intrinsics, Lens
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, quote
+from edge_se_sampler.errors import InputError
 
 MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
@@ -32,6 +33,8 @@ MODELS = {
 SUPPORTED = [name for name, _ in list(MODELS.values())[:6]]
 MAX_SIZE = 10**6
 """Pixels, of a side."""
+MAX_COORDINATE = 1e30
+"""World units: products of larger ones overflow."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,9 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
     records = list((_text_points if path.suffix == ".txt" else _binary_points)(path))
     ids = np.array([number for number, _ in records], dtype=np.int64)
     positions = np.array([position for _, position in records], dtype=np.float64).reshape(-1, 3)
-    if not np.isfinite(positions).all():
-        bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
+    valid = (np.abs(positions) < MAX_COORDINATE).all(axis=1)
+    if not valid.all():
+        bad = int(np.flatnonzero(~valid)[0])
         raise SourceLocation(path).item(bad).error("its position is not finite", "write the model again")
     order = np.argsort(ids, kind="stable")
     return ids[order], positions[order]
@@ -137,8 +141,7 @@ def _image(
     location: SourceLocation, name: str, camera_id: int, motion: list[float], point_ids: np.ndarray
 ) -> ColmapImage:
     """`motion`: quaternion w, x, y, z and translation, world to camera, OpenCV's axes."""
-    norm = float(np.linalg.norm(motion[:4]))
-    if not np.isfinite(motion).all() or not 1e-6 < norm < 1e6:
+    if not np.abs(motion).max() < MAX_COORDINATE or (norm := float(np.linalg.norm(motion[:4]))) < 1e-6:
         raise location.error("its pose is not finite, or no rotation", "write the model again")
     w, x, y, z = (value / norm for value in motion[:4])
     rotation = np.array(
@@ -222,7 +225,7 @@ def _binary_images(path: Path) -> Iterator[ColmapImage]:
 def _binary_points(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
     cursor = _Cursor(path)
     for location in cursor.records("points3D", 51):
-        number, x, y, z = cursor.read("Q3d", location)
+        number, x, y, z = cursor.read("q3d", location)
         cursor.read("3Bd", location)
         track = cursor.count(8, location)
         cursor.position += 8 * track
@@ -238,11 +241,26 @@ def _lines(path: Path) -> Iterator[tuple[SourceLocation, list[str]]]:
             yield SourceLocation(path, f"line {i + 1}"), line.split()
 
 
-def _numbers(location: SourceLocation, words: list[str], kind: Callable[[str], float] = float) -> list:
+def _numbers(location: SourceLocation, words: list[str]) -> list[float]:
     try:
-        return [kind(word) for word in words]
-    except (ValueError, OverflowError):
-        raise location.error(f"has {quote(' '.join(words))} where numbers belong", "write the model again") from None
+        return [float(word) for word in words]
+    except ValueError:
+        raise _no_numbers(location, words) from None
+
+
+def _ids(location: SourceLocation, words: list[str]) -> list[int]:
+    """Whole numbers of 64 bits."""
+    try:
+        numbers = [int(word) for word in words]
+    except ValueError:
+        raise _no_numbers(location, words) from None
+    if any(not -(2**63) <= number < 2**63 for number in numbers):
+        raise location.error("has an id of more than 64 bits", "write the model again")
+    return numbers
+
+
+def _no_numbers(location: SourceLocation, words: list[str]) -> InputError:
+    return location.error(f"has {quote(' '.join(words))} where numbers belong", "write the model again")
 
 
 def _words(location: SourceLocation, words: list[str], count: int) -> list[str]:
@@ -255,7 +273,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[SourceLocation, int, str, list[f
     for location, words in _lines(path):
         if words:
             number, name, *values = _words(location, words, 4)
-            yield location, *_numbers(location, [number], int), name, _numbers(location, values)
+            yield location, *_ids(location, [number]), name, _numbers(location, values)
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
@@ -264,16 +282,14 @@ def _text_images(path: Path) -> Iterator[ColmapImage]:
         if not words:
             continue
         motion = _numbers(location, _words(location, words, 10)[1:8])
-        (camera_id,) = _numbers(location, words[8:9], int)
+        (camera_id,) = _ids(location, words[8:9])
         _, points = next(lines, (location, []))  # an empty line for an image that sees none
-        ids = _numbers(location, points[2::3], int)
-        if any(not -(2**63) <= number < 2**63 for number in ids):
-            raise location.error("a point's id has more than 64 bits", "write the model again")
-        yield _image(location, " ".join(words[9:]), camera_id, motion, np.array(ids, dtype=np.int64))
+        point_ids = np.array(_ids(location, points[2::3]), dtype=np.int64)
+        yield _image(location, " ".join(words[9:]), camera_id, motion, point_ids)
 
 
 def _text_points(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
     for location, words in _lines(path):
         if words:
-            numbers = _numbers(location, _words(location, words, 4)[:4])
-            yield int(numbers[0]), tuple(numbers[1:])
+            (number,) = _ids(location, _words(location, words, 4)[:1])
+            yield number, tuple(_numbers(location, words[1:4]))
