@@ -215,7 +215,7 @@ def test_a_link_that_leads_out(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("flag", [{"downscale": 0}, {"downscale": 40}, {"eval_every": 1}, {"eval_every": 0}])
-def test_bad_settings(flag: dict[str, int], tmp_path: Path) -> None:
+def test_bad_settings(flag: dict[str, Any], tmp_path: Path) -> None:
     write_transforms(tmp_path)
     with pytest.raises(InputError, match=f"--{next(iter(flag)).replace('_', '-')}"):
         read_split(tmp_path, "train", DataSettings(**flag))

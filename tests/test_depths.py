@@ -39,7 +39,7 @@ def opaque(views: Views) -> Views:
 @pytest.mark.parametrize("scale", [1.0, 0.01, 300.0])
 def test_silhouettes_of_a_ball(scale: float) -> None:
     """The ball of radius 1, 4 away, in whatever units: nothing of it is cut off, and little is added."""
-    found = find_depths(moved(ball_views(12, 32), scale, (5.0, -70.0, 2.0)))
+    found = find_depths(moved(ball_views(16, 64), scale, (5.0, -70.0, 2.0)))
     assert found.source == "the silhouettes"
     assert 2.4 < found.near / scale <= 3
     assert 5 <= found.far / scale < 5.6

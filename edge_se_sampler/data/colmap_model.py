@@ -273,7 +273,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[SourceLocation, int, str, list[f
     for location, words in _lines(path):
         if words:
             number, name, *values = _words(location, words, 4)
-            yield location, *_ids(location, [number]), name, _numbers(location, values)
+            yield location, _ids(location, [number])[0], name, _numbers(location, values)
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:

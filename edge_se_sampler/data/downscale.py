@@ -1,33 +1,8 @@
-"""Smaller images: averages over squares of k x k pixels, and the cameras that would have taken them."""
+"""Smaller images: averages over squares of k x k pixels; what is left over at the right and lower border is cut off."""
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from functools import partial
-
 import numpy as np
-
-from edge_se_sampler.data.views import Views
-from edge_se_sampler.errors import InputError
-
-
-def downscale(views: Views, factor: int) -> Views:
-    """The views with every k x k pixels made one, k being the factor; what is left over at the right and lower border
-    is cut off. Colors are averaged premultiplied by alpha, so what is transparent does not show; a pixel may be trained
-    on if all of its k x k may. InputError: k is larger than an image."""
-    if factor == 1:
-        return views
-    for name, image in zip(views.names, views.images, strict=True):
-        if factor > min(image.shape[:2]):
-            size = f"{image.shape[1]} x {image.shape[0]} pixels"
-            raise InputError(f"--downscale is {factor}, but {name} has only {size}; give a smaller number")
-    with ThreadPoolExecutor() as pool:  # numpy releases Python's lock
-        images = tuple(pool.map(partial(average_pixels, factor=factor), views.images))
-    masks = None
-    if views.masks is not None:
-        masks = tuple(shrink_mask(mask, factor) for mask in views.masks)
-    return replace(views, images=images, masks=masks, cameras=views.cameras.downscale(factor))
 
 
 def average_pixels(image: np.ndarray, factor: int) -> np.ndarray:
