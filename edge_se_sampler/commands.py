@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from edge_se_sampler.data.config import DataFormat, Masks
+from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 if TYPE_CHECKING:
-    from edge_se_sampler.engine.config import TrainerConfig
+    from edge_se_sampler.data.views import Views
     from edge_se_sampler.engine.run_folder import RunFolder
 
 
@@ -94,7 +96,7 @@ class Offcenter:
 
 @dataclass(frozen=True)
 class Train:
-    """Train a method on a Blender folder: edge-se train METHOD --data DIR."""
+    """Train a method on a folder of images and cameras: edge-se train METHOD --data DIR."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,26 @@ class Render(_RunCommand):
         print(self.output_path)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Data:
+    data: Path
+    """A folder of images and their cameras, as in training."""
+    data_format: DataFormat = "auto"
+    """Format of the folder; auto: by what it has."""
+    masks: Masks = "ignore"
+    """What is outside of mask files: unknown (ignore), or background (object)."""
+    eval_every: int | None = None
+    """Every how many images one is left out, as held out in training; by default 8 where the data has no split."""
+    downscale: int = 1
+    """Average every DOWNSCALE x DOWNSCALE pixels first, as in training."""
+
+    def _read(self) -> Views:
+        from edge_se_sampler.engine.session import read_train_views
+
+        names = ("data", "data_format", "masks", "eval_every", "downscale")
+        return read_train_views(TrainerConfig(**{name: getattr(self, name) for name in names}))
+
+
 @dataclass(frozen=True)
 class _ShownSettings:
     num_rays_per_batch: int = EdgeSEPixelSamplerConfig.num_rays_per_batch
@@ -174,12 +196,10 @@ class _ShownSettings:
     """Strength that every pixel has besides its edge."""
 
 
-@dataclass(frozen=True)
-class Show:
+@dataclass(frozen=True, kw_only=True)
+class Show(_Data):
     """Picture what a sampler does to your own images: view, probability of every pixel, and the pixels of a batch."""
 
-    data: Path
-    """A Blender folder."""
     output_path: Path = Path("show.png")
     """The picture to write."""
     strategy: Literal["uniform", "precrop", "edge"] = "edge"
@@ -192,7 +212,6 @@ class Show:
     """Settings of the distribution and the batch, under their names in training."""
 
     def run(self) -> None:
-        from edge_se_sampler.data.blender import read_blender
         from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.engine.show import show
 
@@ -200,40 +219,32 @@ class Show:
         check_value("num-views", self.num_views, self.num_views >= 1, "at least 1")
         check_value("pixel-sampler.num-rays-per-batch", rays, rays >= 1, "at least 1")
         check_output(self.output_path)
-        views = read_blender(self.data, "train")
+        views = self._read()
         config = EdgeSEPixelSamplerConfig(**vars(self.pixel_sampler))
         show(views, config, self.strategy, self.output_path, self.num_views, self.seed)
         print(self.output_path)
 
 
-@dataclass(frozen=True)
-class Inspect:
+@dataclass(frozen=True, kw_only=True)
+class Inspect(_Data):
     """Print and picture where a scene can be occupied, and the sizes derived from its cameras and alpha."""
 
-    data: Path
-    """A Blender folder."""
     output_path: Path = Path("inspect.png")
     """The picture to write."""
-    downscale: int = 1
-    """Average every DOWNSCALE x DOWNSCALE pixels first, as in training."""
-    near: float = LeanModelConfig.near
-    """Depth along the optical axis at which samples begin, world units."""
-    far: float = LeanModelConfig.far
-    """Depth at which samples end."""
+    near: float | None = None
+    """Depth along the optical axis at which samples begin, world units; by default from the scene."""
+    far: float | None = None
+    """Depth at which samples end; by default from the scene."""
     voxel_size_px: float = LeanModelConfig.voxel_size_px
     """About the size of the finest cells, in widths of a pixel at the center of the scene."""
 
     def run(self) -> None:
-        from edge_se_sampler.data.blender import read_blender
-        from edge_se_sampler.data.downscale import downscale
         from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.engine.inspection import inspect
 
-        check_value("downscale", self.downscale, self.downscale >= 1, "at least 1")
         check_output(self.output_path)
         config = LeanModelConfig(near=self.near, far=self.far, voxel_size_px=self.voxel_size_px)
-        views = downscale(read_blender(self.data, "train"), self.downscale)
-        print(inspect(views, config, self.output_path))
+        print(inspect(self._read(), config, self.output_path))
         print(self.output_path)
 
 

@@ -27,7 +27,6 @@ from blender_folder import (
 )
 
 from edge_se_sampler.data.blender import has_split, read_blender
-from edge_se_sampler.errors import InputError
 
 
 @pytest.fixture
@@ -191,16 +190,15 @@ def test_files_that_no_frame_lists_are_ignored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("level", ["file", "frame"])
-def test_lens_distortion_is_refused_unless_it_is_zero(level: str, tmp_path: Path) -> None:
+def test_lens_distortion_is_undone_unless_it_is_zero(level: str, tmp_path: Path) -> None:
     doc = write_scene(tmp_path, split="test")
     parent = doc if level == "file" else doc["frames"][1]
     parent |= {"k1": 0, "p2": 0.0}
     write_json(tmp_path, doc, "test")
-    assert len(read_blender(tmp_path, "test").images) == 3
+    np.testing.assert_array_equal(read_blender(tmp_path, "test").images[1], pixels(1))
     parent["k1"] = 0.3
     write_json(tmp_path, doc, "test")
-    with pytest.raises(InputError, match=r"k1: is 0\.3, but lens distortion is not supported"):
-        read_blender(tmp_path, "test")
+    assert (read_blender(tmp_path, "test").images[1] != pixels(1)).any()
 
 
 def test_rounded_poses_are_kept_as_written(tmp_path: Path, doc: dict[str, Any]) -> None:

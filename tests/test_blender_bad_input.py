@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from blender_folder import HEIGHT, WIDTH, pixels, png, write_json, write_scene
 
-from edge_se_sampler.data import blender
+from edge_se_sampler.data import frames, image_file
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.errors import InputError
 
@@ -333,7 +333,8 @@ def test_the_json_is_checked_to_its_end_before_any_image(
     def never(*args: object) -> None:
         raise AssertionError("an image was read")
 
-    monkeypatch.setattr(blender, "read_image", never)
+    monkeypatch.setattr(frames, "read_image", never)
+    monkeypatch.setattr(image_file, "read_image", never)
     for change in (put(f"{MATRIX} 2 2", 5), put("frames 2 file_path", "../outside"), put("frames 2 mask_path", 1)):
         spoilt = json.loads(json.dumps(doc))
         change(spoilt)

@@ -15,7 +15,7 @@ from tiny import SMALL, tiny_views
 
 from edge_se_sampler.cli import main
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.downscale import average_pixels, downscale
+from edge_se_sampler.data.downscale import average_pixels, shrink_mask
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.session import read_test_views, read_train_views
 from edge_se_sampler.errors import InputError
@@ -52,17 +52,15 @@ def test_opaque_images_are_averaged_and_the_rest_is_cut_off() -> None:
 def test_a_small_pixel_is_trained_on_if_all_of_it_is() -> None:
     mask = np.ones((8, 6), dtype=bool)
     mask[3, 4] = False
-    small = downscale(tiny_views(1, masks=(mask,)), 2).masks
-    assert small is not None
-    np.testing.assert_array_equal(np.argwhere(~small[0]), [[1, 2]])
+    np.testing.assert_array_equal(np.argwhere(~shrink_mask(mask, 2)), [[1, 2]])
 
 
 def test_a_small_pixels_ray_goes_through_the_middle_of_its_pixels() -> None:
     views = tiny_views(2, height=9, width=6)
     views = replace(views, cameras=replace(views.cameras, cx=views.cameras.cx + 0.7))
-    small = downscale(views, 3)
-    assert (int(small.cameras.height[0]), int(small.cameras.width[0])) == small.images[0].shape[:2] == (3, 2)
-    ray = small.cameras.pixel_rays(torch.tensor([[1, 2, 1]]))
+    small = views.cameras.downscale(3)
+    assert (int(small.height[0]), int(small.width[0])) == average_pixels(views.images[0], 3).shape[:2] == (3, 2)
+    ray = small.pixel_rays(torch.tensor([[1, 2, 1]]))
     middle = views.cameras.pixel_rays(torch.tensor([[1, 7, 4]]))  # of rows 6 to 8 and columns 3 to 5
     torch.testing.assert_close(ray.directions, middle.directions)
     torch.testing.assert_close(ray.origins, middle.origins)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from edge_se_sampler.protocol import InstantiateConfig, PixelSamplerConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+
+DataFormat = Literal["auto", "blender", "transforms", "colmap"]
+Masks = Literal["ignore", "object"]
 
 
 @dataclass(frozen=True)

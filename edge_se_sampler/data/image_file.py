@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from dataclasses import dataclass
 from typing import Any
 
 import imageio.v3 as iio
@@ -17,6 +18,48 @@ _COPY_AGAIN = "copy or download it again"
 
 # pillow's mode of the file -> the mode to read it in; others (CMYK, 32 bits, float) have no plain 8-bit meaning
 _MODES = {"1": "RGB", "L": "RGB", "P": "RGB", "RGB": "RGB", "LA": "RGBA", "PA": "RGBA", "RGBA": "RGBA"}
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What an image file says before it is decoded."""
+
+    width: int
+    """Pixels, as stored."""
+    height: int
+    channels: int = 3
+    """3 or 4, as `read_image` returns them."""
+    orientation: int = 1
+    """EXIF's: how programs that heed it turn the pixels; 1: not at all, 5 to 8: by a quarter (EXIF 2.3, tag 274)."""
+
+    def upright(self) -> ImageHeader:
+        """The header of the image that is turned as its orientation says."""
+        swapped = self.orientation >= 5
+        size = (self.height, self.width) if swapped else (self.width, self.height)
+        return ImageHeader(*size, self.channels, self.orientation)
+
+
+def read_header(file: SourceFile) -> ImageHeader:
+    """The header of an image file; InputError, as `read_image` raises, for one that has none."""
+    try:
+        file.check_regular()
+        with file.path.open("rb") as stream, iio.imopen(stream, "r", plugin="pillow") as opened:
+            metadata = opened.metadata(index=0, exclude_applied=False)
+        (width, height), orientation = metadata["shape"], metadata.get("Orientation", 1)
+        channels = 4 if "transparency" in metadata or _MODES.get(metadata["mode"]) == "RGBA" else 3
+    except Exception:  # decoding says what is wrong
+        height, width, channels = read_image(file).shape
+        return ImageHeader(width, height, channels)
+    return ImageHeader(width, height, channels, orientation if orientation in range(1, 9) else 1)
+
+
+def turn_upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """The pixels (H, W, ...) turned as an EXIF orientation of 5 to 8 says; others are left as they are."""
+    if orientation < 5:
+        return image
+    image = image.swapaxes(0, 1)
+    flips = {5: np.s_[:], 6: np.s_[:, ::-1], 7: np.s_[::-1, ::-1], 8: np.s_[::-1]}
+    return np.ascontiguousarray(image[flips[orientation]])
 
 
 def read_image(file: SourceFile) -> np.ndarray:

@@ -24,9 +24,11 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.blender import SPLITS, Split, has_split, listed_file, read_blender, transforms_path
+from edge_se_sampler.data.blender import has_split, read_blender, transforms_path
+from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
+from edge_se_sampler.data.transforms_frames import listed_file, read_entries, read_lens
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
@@ -143,7 +145,11 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
     found: tuple[Split, ...] = tuple(split for split in SPLITS if has_split(data, split))
     for split in found or SPLITS[:1]:  # where there is none, the loader says so
         views = read_blender(data, split)
-        frames = read_json(transforms_path(data, split)).required("frames", "").list()
+        top = read_json(transforms_path(data, split))
+        frames = top.required("frames", "").list()
+        for entry in read_entries(top, data):
+            if read_lens(entry.intrinsics) is not None:
+                raise entry.location.error("its lens distorts", "undistort the images, and leave its coefficients out")
         plan[split] = [_output_files(data, frame, written) for frame in frames]
         for image, frame in zip(views.images, frames, strict=True):
             background = plain_background(image)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import reprlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,13 +56,17 @@ class SourceFile:
     def error(self, problem: str, hint: str) -> InputError:
         return self.location.error(f"{quote(self.name)} {problem}" if self.name else problem, hint)
 
+    def check_regular(self) -> None:
+        """InputError for a directory or a pipe, which reading would wait for."""
+        if self.path.is_dir():
+            raise self.error("is a directory", "a file is expected there")
+        if self.path.exists() and not self.path.is_file():
+            raise self.error("is not a regular file", "a plain file is expected there")
+
     def read_bytes(self) -> bytes:
         """All of its bytes; InputError for a file that is missing, empty, unreadable, or not regular."""
         try:
-            if self.path.is_dir():
-                raise self.error("is a directory", "a file is expected there")
-            if self.path.exists() and not self.path.is_file():  # reading a pipe would block
-                raise self.error("is not a regular file", "a plain file is expected there")
+            self.check_regular()
             data = self.path.read_bytes()
         except FileNotFoundError:
             raise self.error("does not exist", "put the file there or correct the path") from None
@@ -70,6 +76,35 @@ class SourceFile:
         if not data:
             raise self.error("is empty (0 bytes)", "copy or download it again")
         return data
+
+
+def check_folder(folder: Path) -> None:
+    """InputError if that is no folder that may be read."""
+    location, hint = SourceLocation(folder), "give the folder of a scene"
+    if not os.path.lexists(folder):
+        raise location.error("no such folder", hint)
+    if not os.path.isdir(folder):
+        raise location.error("is not a folder", hint)
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise location.error("may not be read (permission denied)", "change the folder's permissions")
+
+
+def locate_file(folder: Path, listed: str, location: SourceLocation) -> SourceFile:
+    """The file that is listed, relative to `folder`; InputError if that lies outside it, be it through a link."""
+    if os.path.isabs(listed):
+        raise location.error(f"{quote(listed)} is an absolute path", "write it relative to the folder")
+    file = SourceFile(Path(os.path.realpath(folder / listed)), location, listed)
+    if not file.path.is_relative_to(os.path.realpath(folder)):
+        raise file.error("leads out of the folder", "put the file into the folder")
+    return file
+
+
+def check_listed_once(files: Iterable[SourceFile]) -> None:
+    """InputError if two of the files are the same one, be it through a link."""
+    first: dict[Path, SourceFile] = {}
+    for file in files:
+        if (other := first.setdefault(file.path, file)) is not file:
+            raise file.error(f"is already the image of {other.location.field}", "list every image once")
 
 
 @dataclass(frozen=True)

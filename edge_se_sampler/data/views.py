@@ -9,6 +9,9 @@ import numpy as np
 
 from edge_se_sampler.data.cameras import Cameras
 
+NERF_SYNTHETIC_DEPTHS = (2.0, 6.0)
+"""Between them lie NeRF's Blender scenes, world units."""
+
 
 @dataclass(frozen=True)
 class Views:
@@ -18,15 +21,30 @@ class Views:
     images: tuple[np.ndarray, ...]  # view i: (H_i, W_i, 3|4) uint8, sRGB, straight alpha
     masks: tuple[np.ndarray, ...] | None  # view i: (H_i, W_i) bool, True where it may be trained on; None: everywhere
     cameras: Cameras  # n, float64: poses as the scene gives them, not moved or scaled
+    points: tuple[np.ndarray, ...] | None = None  # view i: (m_i, 3) points of the scene that it sees, world units
+    depths: tuple[float, float] | None = NERF_SYNTHETIC_DEPTHS  # near and far by the format; None: it has none
+    data_format: str | None = None  # None: made in memory
+    eval_every: int | None = None  # every how many images one is held out; None: the data has a split
 
     def subset(self, indices: Sequence[int]) -> Views:
         """The views of these indices, in this order."""
-        masks = None if self.masks is None else tuple(self.masks[i] for i in indices)
+        masks, points = (v if v is None else tuple(v[i] for i in indices) for v in (self.masks, self.points))
         names, images = zip(*((self.names[i], self.images[i]) for i in indices), strict=True)
-        return Views(names, images, masks, self.cameras[list(indices)])
+        cameras = self.cameras[list(indices)]
+        return replace(self, names=names, images=images, masks=masks, cameras=cameras, points=points)
 
     def with_masks(self, masks: Sequence[np.ndarray]) -> Views:
         """The same views, to be trained on only where both `masks` and the views' own, if any, are True."""
         if self.masks is not None:
             masks = [mask & own for mask, own in zip(masks, self.masks, strict=True)]
         return replace(self, masks=tuple(masks))
+
+    def describe(self) -> str:
+        """How many views of which sizes there are, and what their alpha and masks mean, in a line."""
+        sizes = " and ".join(f"{w} x {h}" for w, h in sorted({image.shape[1::-1] for image in self.images}))
+        alpha = any(image.shape[2] == 4 for image in self.images)
+        meanings = ["alpha (transparent is background)"] * alpha
+        meanings += ["masks (outside is unknown, and not trained on)"] * (self.masks is not None)
+        held_out = f", every {self.eval_every}th image held out" if self.eval_every else ""
+        source = f"{self.data_format}: " if self.data_format else ""
+        return f"{source}{len(self.images)} views of {sizes}{held_out}; {' and '.join(meanings) or 'no masks'}"

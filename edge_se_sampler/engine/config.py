@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
-from edge_se_sampler.data.config import VanillaDataManagerConfig
+from edge_se_sampler.data.config import DataFormat, Masks, VanillaDataManagerConfig
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.config import (
     INFINITY,
@@ -68,7 +68,15 @@ class TrainerConfig(InstantiateConfig):
     method_name: Annotated[str, tyro.conf.Suppress] = "edge-se-nerf"
     """Name of the method, part of the run folder's path."""
     data: Path | None = None
-    """The Blender folder (transforms_train.json and so on) to train on."""
+    """The folder to train on: images, and their cameras in a format that it is told by."""
+    data_format: DataFormat = "auto"
+    """Format of the folder: NeRF's Blender scenes (transforms_train.json and so on), one transforms.json (nerfstudio,
+    instant-ngp), or COLMAP's sparse model; auto: the first of these that it has."""
+    masks: Masks = "ignore"
+    """What mask files mean. ignore: what is outside is unknown, and not trained on; object: it is background, as if
+    the mask were the image's alpha."""
+    eval_every: int | None = None
+    """Hold out every EVAL_EVERY-th image in the order of names, where the data has no split; by default 8."""
     num_views: int | None = None
     """Train on this many of the views, selected as InfoNeRF's code does; by default on all."""
     views: tuple[int, ...] | None = None

@@ -9,7 +9,7 @@ import numpy as np
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
-from edge_se_sampler.engine.pipeline import analyze_views
+from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis
 from edge_se_sampler.sampling.edges import unit_float
@@ -20,7 +20,7 @@ NUM_VIEWS = 3  # in the picture
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     """What is derived from training views, one finding a line; draws it too. InputError for bad settings or outputs."""
     pyplot = require_pyplot()
-    config = decide_size(config, views.images)
+    config, depth_source = resolve_depths(views, decide_size(config, views.images))
     config.check()
     analysis = analyze_views(views, config)
     hull, hit_pixels = analysis.hull, analysis.hit_pixels
@@ -38,10 +38,12 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
         axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")
     figure.tight_layout()
     save_figure(figure, path)
-    return "\n".join(f"{name:<13}{finding}" for name, finding in _findings(views, analysis, config).items())
+    return "\n".join(
+        f"{name:<13}{finding}" for name, finding in _findings(views, analysis, config, depth_source).items()
+    )
 
 
-def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig) -> dict[str, str]:
+def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, depth_source: str) -> dict[str, str]:
     hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.box.pixel_footprint
     num_views, num_occupied = len(views.images), hull.cells.sum()
     sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
@@ -52,6 +54,8 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig) ->
     share = np.mean(np.concatenate([hit.ravel() for hit in analysis.hit_pixels]))
     return {
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
+        "data": views.describe(),
+        "depths": f"{config.near:g} to {config.far:g}, by {depth_source}",
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
         "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",

@@ -12,9 +12,10 @@ from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import ModelConfig
+from edge_se_sampler.models.config import Model, ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.depths import find_depths
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -29,13 +30,15 @@ class Pipeline:
     datamanager: VanillaDataManager
     model: Any
     """A RayModel."""
+    data_summary: str = ""
+    """What the training views are, in a line."""
 
     @classmethod
     def build(cls, config: TrainerConfig, views: Views, device: str, saved_grid: BrickGrid | None = None) -> Pipeline:
         """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own. InputError
         if the checkpoint's grid is another scene's."""
         model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
-        grid, has_masks = saved_grid, False
+        grid, has_masks, summary = saved_grid, False, views.describe()
         if model_config.needs_grid:
             analysis = analyze_views(views, model_config)
             grid = analysis.grid()
@@ -50,13 +53,23 @@ class Pipeline:
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
         datamanager = manager_config.setup(views=views, device=device, background_color=background)
-        return cls(datamanager, build_model(config, device, saved_grid or grid))
+        return cls(datamanager, build_model(config, device, saved_grid or grid), summary)
 
 
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
     """`analyze_scene` with a model's settings."""
     size_px, by_alpha = config.voxel_size_px, config.culls_by_alpha
-    return analyze_scene(views, config.near, config.far, voxel_size_px=size_px, by_alpha=by_alpha)
+    return analyze_scene(views, *config.depths, voxel_size_px=size_px, by_alpha=by_alpha)
+
+
+def resolve_depths(views: Views, config: Model) -> tuple[Model, str]:
+    """The config with near and far, where they are left out, from the training views, and what told them."""
+    if config.near is not None and config.far is not None:
+        return config, "as set"
+    found = find_depths(views)
+    near = found.near if config.near is None else config.near
+    far = found.far if config.far is None else config.far
+    return replace(config, near=near, far=far), found.source
 
 
 def build_model(config: TrainerConfig, device: str, grid: BrickGrid | None = None) -> RayModel:

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge_se_sampler.data.blender import Split, has_split, read_blender
-from edge_se_sampler.data.downscale import downscale
+from edge_se_sampler.data.capture import Split
+from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
+from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, resolve_depths, saved_grid
+from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
@@ -52,11 +53,14 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     whatever the views. InputError if a value is out of its range."""
     config.check_plan()
     data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
+    model, _ = resolve_depths(views, model)
     config = replace(config, pipeline=replace(config.pipeline, model=model))
     preset, by_steps = config.preset, config.time_budget is None and config.segments is None
     resolved = replace(
         config,
         data=data,
+        data_format=(views.data_format or "auto") if config.data_format == "auto" else config.data_format,
+        eval_every=config.eval_every or views.eval_every,
         experiment_name=config.experiment_name or (data.name if data else "unnamed"),
         max_num_iterations=preset.iterations if by_steps else None,
         steps_per_eval_image=config.preview_interval if by_steps else config.steps_per_eval_image,
@@ -96,25 +100,31 @@ def read_test_views(config: TrainerConfig) -> Views:
         raise InputError(f"{config.data}: no such folder, where this run's held-out views were")
     views = _read_first_split(config, ("test", "val"))
     if views is None:
-        raise InputError(f"{config.data}: no held-out views; transforms_test.json or transforms_val.json is needed")
+        remedy = "transforms_test.json, transforms_val.json or another list of test images is needed"
+        raise InputError(f"{config.data}: no held-out views; {remedy}")
     return views
 
 
 def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views | None:
-    assert config.data is not None
-    found = (read_blender(config.data, split) for split in splits if has_split(config.data, split))
-    views = next((views for views in found if views.names), None)
-    return None if views is None else downscale(views, config.downscale)
+    found = (_read_split(config, split) for split in splits)
+    return next((views for views in found if views is not None), None)
 
 
 def read_train_views(config: TrainerConfig) -> Views:
     """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
     if config.data is None:
-        raise InputError("--data is missing: the Blender folder to train on (edge-se scenes makes some)")
-    check_value("downscale", config.downscale, config.downscale >= 1, "at least 1")
-    views = read_blender(config.data, "train")
+        raise InputError("--data is missing: the folder to train on (edge-se scenes makes some)")
+    views = _read_split(config, "train")
+    assert views is not None
     selected = select_views(config, len(views.names))
-    return downscale(views if selected is None else views.subset(selected), config.downscale)
+    return views if selected is None else views.subset(selected)
+
+
+def _read_split(config: TrainerConfig, split: Split) -> Views | None:
+    assert config.data is not None
+    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale)
+    with Progress(0, "reading images") as progress:
+        return read_split(config.data, split, settings, progress.update)
 
 
 def select_views(config: TrainerConfig, count: int) -> list[int] | None:
@@ -142,6 +152,8 @@ def describe_run(trainer: Trainer) -> str:
     plan = f"{trainer.plan.num_steps} iterations" if config.time_budget is None else f"{config.budget_seconds:.0f} s"
     lines = [
         f"run      {trainer.run.path}",
+        f"data     {trainer.pipeline.data_summary}",
+        f"depths   {model.near:g} to {model.far:g}",
         f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
         f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",
     ]

@@ -61,10 +61,10 @@ class ModelConfig(InstantiateConfig):
     """Networks and samples: the paper's, or smaller ones for smaller images; auto: by the images' longest side."""
     background_color: Literal["white", "black", "random"] = "white"
     """Background of the scene; random: another color for every training ray, white in evaluation."""
-    near: float = 2.0
-    """Depth along the optical axis at which samples begin, world units."""
-    far: float = 6.0
-    """Depth at which samples end, world units."""
+    near: float | None = None
+    """Depth along the optical axis at which samples begin, world units; by default from the scene, see inspect."""
+    far: float | None = None
+    """Depth at which samples end, world units; by default from the scene."""
     voxel_size_px: float = 1.0
     """A quarter of a grid cell's size, in footprints of a pixel at the center of the scene; larger where there would be
     too many cells."""
@@ -73,6 +73,11 @@ class ModelConfig(InstantiateConfig):
     def preset(self) -> SizePreset:
         """The numbers of its size, which is not auto, with those set here in their place: none is left open."""
         return self.presets[self.size].overridden_by(vars(self))
+
+    @property
+    def depths(self) -> tuple[float, float]:
+        """Near and far; NeRF-synthetic's, where no scene has decided."""
+        return 2.0 if self.near is None else self.near, 6.0 if self.far is None else self.far
 
     @property
     def background_level(self) -> float:
@@ -91,8 +96,9 @@ class ModelConfig(InstantiateConfig):
 
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
-        if not 0 <= self.near < self.far < INFINITY:
-            raise InputError(f"--{prefix}near is {self.near}, --{prefix}far {self.far}: 0 <= near < far")
+        near, far = self.depths
+        if not 0 <= near < far < INFINITY:
+            raise InputError(f"--{prefix}near is {near}, --{prefix}far {far}: 0 <= near < far")
         size_px = self.voxel_size_px
         check_value(f"{prefix}voxel-size-px", size_px, 0 < size_px <= 1000, "above 0, at most 1000")
 

@@ -193,7 +193,7 @@ class LeanModel(RayModel):
         outputs = {"rgb_fine": rgb + passing * background, "accumulation_fine": accumulation}
         if not self.training:
             depth = distance * float(self.grid.cell_size)
-            outputs["depth_fine"] = depth + passing * self.config.far * rays.metadata["directions_norm"]
+            outputs["depth_fine"] = depth + passing * self.config.depths[1] * rays.metadata["directions_norm"]
         return outputs | {"background": background}, rendered
 
     def _spans(self, rays: RayBundle) -> RaySpans:
@@ -203,13 +203,14 @@ class LeanModel(RayModel):
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
         norm = rays.metadata["directions_norm"][:, 0] / float(cell_size)
+        near, far = self.config.depths
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
         return RaySpans(
             origins,
             rays.directions,
-            torch.maximum(begin, self.config.near * norm),
-            torch.minimum(end, self.config.far * norm),
+            torch.maximum(begin, near * norm),
+            torch.minimum(end, far * norm),
         )
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:

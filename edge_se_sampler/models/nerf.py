@@ -62,7 +62,8 @@ class NeRFModel(RayModel):
         """Render by the coarse network: t and weights of its samples (n, s), colors and backgrounds (n, 3)."""
         norm = rays.metadata["directions_norm"]
         jitter = self.uniform(len(rays), self.num_coarse_samples) if self.training else None
-        t = stratified(self.config.near * norm, self.config.far * norm, self.num_coarse_samples, jitter)
+        near, far = self.config.depths
+        t = stratified(near * norm, far * norm, self.num_coarse_samples, jitter)
         background = self.get_background(rays)
         weights, rgb, _ = self._render(self.coarse, rays, t, background)
         return t, weights, rgb, background

@@ -14,7 +14,7 @@ import numpy as np
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.runner import Run, run_in_subprocess
 from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.downscale import downscale
+from edge_se_sampler.data.frames import LoadSettings
 from edge_se_sampler.engine.config import MODEL, SAMPLER, override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.rendering import Picture, to_pictures
@@ -103,10 +103,10 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
 
 
 def _pictures(trial: Trial, scenes: Path, split: Any, count: int | None = None) -> list[Picture]:
-    views = read_blender(scenes / trial.scene, split)
+    views = read_blender(scenes / trial.scene, split, LoadSettings(downscale=trial.downscale))
     if count is not None:
         views = views.subset(np.linspace(0, len(views.names) - 1, count).astype(int).tolist())
-    return to_pictures(downscale(views, trial.downscale))
+    return to_pictures(views)
 
 
 def _mean_psnr(model: Any, pictures: list[Picture]) -> float:

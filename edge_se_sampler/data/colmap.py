@@ -1,0 +1,94 @@
+"""Folders with images and a sparse model of COLMAP."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from edge_se_sampler.data.capture import Capture, keep_existing
+from edge_se_sampler.data.colmap_model import (
+    ColmapCamera,
+    ColmapImage,
+    find_model,
+    read_cameras,
+    read_images,
+    read_points,
+)
+from edge_se_sampler.data.frames import Frame, choose_orientation, read_headers
+from edge_se_sampler.data.image_file import ImageHeader
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, check_listed_once, locate_file
+
+FOLDERS = ("images", "images_2", "images_4", "images_8")
+"""Where the images may be: the largest ones that there are."""
+ROUNDING = 1.5
+"""Pixels by which a scaled image's height may be off what its width says."""
+
+
+def read_colmap(folder: Path) -> Capture:
+    """The registered images of a scene that exist, in the order of their names, with the points that each sees. A mask
+    has its image's path in the folder `masks` (masks_2 for images_2, ...), with .png added or in place of the suffix;
+    an image without one is not masked. InputError for files that cannot be used, or if fewer than half of the images
+    exist."""
+    model = find_model(folder)
+    assert model is not None
+    cameras, listed = read_cameras(model), read_images(model)
+    images_folder = _find_images(folder)
+    listed.sort(key=lambda image: image.name)
+    files = [_locate(images_folder, image) for image in listed]
+    check_listed_once(files)
+    for image in listed:
+        if image.camera_id not in cameras:
+            raise image.location.error(f"there is no camera {image.camera_id}", "copy the whole model")
+    pairs, missing = keep_existing(list(zip(listed, files, strict=True)), files, SourceLocation(files[0].location.file))
+    headers = read_headers([file for _, file in pairs])
+    masks_folder = folder / images_folder.name.replace("images", "masks")
+    frames = [
+        _frame(image, cameras[image.camera_id], file, header, masks_folder)
+        for (image, file), header in zip(pairs, headers, strict=True)
+    ]
+    return Capture(frames, missing, points=_points_of(model, [image for image, _ in pairs]))
+
+
+def _find_images(folder: Path) -> Path:
+    for name in FOLDERS:
+        if (folder / name).is_dir():
+            return folder / name
+    raise SourceLocation(folder).error("has no images", f"put them into {', '.join(FOLDERS[:-1])} or {FOLDERS[-1]}")
+
+
+def _locate(images_folder: Path, image: ColmapImage) -> SourceFile:
+    if not image.name.strip():
+        raise image.location.error("has no name", "write the model again")
+    return locate_file(images_folder, image.name, image.location)
+
+
+def _frame(
+    image: ColmapImage, camera: ColmapCamera, file: SourceFile, header: ImageHeader, masks_folder: Path
+) -> Frame:
+    def matches(header: ImageHeader) -> bool:
+        return abs(header.height - header.width * camera.height / camera.width) <= ROUNDING
+
+    header = choose_orientation(file, header, matches)
+    if not matches(header):
+        problem = f"is {header.width} x {header.height} pixels, its camera's images {camera.width} x {camera.height}"
+        raise file.error(problem, "use the images that the model was made of, or scaled ones")
+    scaled = camera.intrinsics.scaled(header.width / camera.width, header.height / camera.height)
+    return Frame(image.name, file, _find_mask(image, masks_folder), image.pose, header, scaled)
+
+
+def _find_mask(image: ColmapImage, masks_folder: Path) -> SourceFile | None:
+    names = (f"{image.name}.png", f"{os.path.splitext(image.name)[0]}.png", image.name)
+    name = next((name for name in names if os.path.isfile(masks_folder / name)), None)
+    return None if name is None else locate_file(masks_folder, name, image.location)
+
+
+def _points_of(model: Path, images: list[ColmapImage]) -> list[np.ndarray] | None:
+    """Of each image the positions of the points that it sees; None if the model has no points."""
+    points = read_points(model)
+    if points is None or not len(points[0]):
+        return None
+    ids, positions = points
+    rows = [np.searchsorted(ids, image.point_ids).clip(max=len(ids) - 1) for image in images]
+    return [positions[row[ids[row] == image.point_ids]] for row, image in zip(rows, images, strict=True)]

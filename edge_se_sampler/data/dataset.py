@@ -1,0 +1,96 @@
+"""Any folder of images with cameras -> the views of one split, by the reader of its format."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from edge_se_sampler.data.blender import has_split, read_blender, transforms_path
+from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Split
+from edge_se_sampler.data.colmap import read_colmap
+from edge_se_sampler.data.colmap_model import find_model
+from edge_se_sampler.data.config import DataFormat, Masks
+from edge_se_sampler.data.frames import LoadSettings, Progress, load_views
+from edge_se_sampler.data.scene_file import SourceLocation, check_folder
+from edge_se_sampler.data.transforms import read_transforms
+from edge_se_sampler.data.views import Views
+from edge_se_sampler.errors import InputError, check_value
+
+READERS = {"transforms": read_transforms, "colmap": read_colmap}
+"""Of the formats whose images we may have to split."""
+CONTENTS = {
+    "blender": "transforms_train.json",
+    "transforms": "transforms.json",
+    "colmap": "sparse/0, sparse or colmap/sparse/0 with cameras, images and points3D",
+}
+"""By what each is told."""
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """How a folder is read."""
+
+    data_format: DataFormat = "auto"
+    masks: Masks = "ignore"
+    eval_every: int | None = None
+    downscale: int = 1
+
+
+def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
+    """The format of a folder by what it has, the first of CONTENTS if there are several, or the one that is insisted
+    on; InputError if the folder has none, or not that one."""
+    check_folder(folder)
+    found: list[DataFormat] = []
+    if any(transforms_path(folder, split).exists() for split in SPLITS):
+        found.append("blender")
+    if (folder / "transforms.json").exists():
+        found.append("transforms")
+    if find_model(folder) is not None:
+        found.append("colmap")
+    if data_format in found or (data_format == "auto" and found):
+        return found[0] if data_format == "auto" else data_format
+    wanted = CONTENTS if data_format == "auto" else {data_format: CONTENTS[data_format]}
+    problem = "has nothing that lists cameras" if data_format == "auto" else f"is no scene in the format {data_format}"
+    hint = "; ".join(f"{name}: {content}" for name, content in wanted.items())
+    raise SourceLocation(folder).error(f"{problem}: no transforms_train.json or the like", f"give a folder with {hint}")
+
+
+def read_split(
+    folder: Path,
+    split: Split,
+    settings: DataSettings = DataSettings(),
+    progress: Progress = lambda done, total: None,
+) -> Views | None:
+    """The views of one split of a folder; None where val or test have none. InputError for what cannot be used."""
+    check_value("downscale", settings.downscale, settings.downscale >= 1, "at least 1")
+    check_value(
+        "eval-every", settings.eval_every, settings.eval_every is None or settings.eval_every >= 2, "at least 2"
+    )
+    data_format = find_format(folder, settings.data_format)
+    load = LoadSettings(settings.masks, settings.downscale)
+    if data_format == "blender":
+        _check_unsplit(settings, has_own_split=True)
+        if split != "train" and not has_split(folder, split):
+            return None
+        return read_blender(folder, split, load, progress)
+    capture = READERS[data_format](folder)
+    _check_unsplit(settings, has_own_split=capture.splits is not None)
+    eval_every = EVAL_EVERY if settings.eval_every is None else settings.eval_every
+    rows = capture.select(split, eval_every)
+    if split == "train":
+        if capture.missing:
+            print(capture.missing, file=sys.stderr)
+        if not rows:
+            raise SourceLocation(folder).error("has no images to train on", "add some, or correct its lists")
+    if not rows:
+        return None
+    views = load_views([capture.frames[i] for i in rows], load, progress)
+    points = None if capture.points is None else tuple(capture.points[i] for i in rows)
+    every = eval_every if capture.splits is None else None
+    return replace(views, points=points, depths=None, data_format=data_format, eval_every=every)
+
+
+def _check_unsplit(settings: DataSettings, has_own_split: bool) -> None:
+    if has_own_split and settings.eval_every is not None:
+        raise InputError("--eval-every has no effect: the data says itself which images are held out; leave it out")

@@ -1,0 +1,113 @@
+"""Between which depths the rays of a scene are sampled, where neither flags nor the format say.
+
+focus  the point nearest to all optical axes
+depth  along a camera's optical axis, world units
+
+The best source there is decides: points that a reconstruction has seen, silhouettes, or the cameras alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, Views
+from edge_se_sampler.occupancy.hull import Box, Hull, carve, find_focus, find_silhouettes
+
+POINT_PERCENTILES = 0.5, 99.5
+"""Of the depths of points: a few are matched wrongly, and lie anywhere."""
+POINT_MARGIN = 0.1
+"""By which the scene may reach beyond its points, as a share of their depth."""
+HULL_RESOLUTION = 64
+"""Cells along the cube that silhouettes carve; it reaches from the focus to the middle camera."""
+MIN_SEEN = 0.9
+"""Share of the views that see a cell of the object, of the most that see any: the others are too few to carve what only
+they see."""
+CAMERA_FACTORS = 0.1, 2.0
+"""Near and far of cameras alone, as multiples of their median distance from the focus: from closely before them to as
+far behind the focus as they are before it."""
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """Depths between which rays are sampled."""
+
+    near: float
+    far: float
+    source: str
+    """What tells."""
+
+
+def find_depths(views: Views) -> DepthRange:
+    """The depths of a scene, from its training views."""
+    if views.depths is not None:
+        return DepthRange(*views.depths, "NeRF's Blender scenes")
+    found = _depths_of_points(views) or _depths_of_silhouettes(views) or _depths_of_cameras(views)
+    return found or DepthRange(*NERF_SYNTHETIC_DEPTHS, "NeRF's Blender scenes, for nothing else tells: set both")
+
+
+def _depths_of_points(views: Views) -> DepthRange | None:
+    """The depths at which views see points, but for the most extreme ones."""
+    seen = [_depth(views.cameras, i, points) for i, points in enumerate(views.points or ())]
+    depths = np.concatenate(seen) if seen else np.empty(0)
+    depths = depths[depths > 0]
+    if not len(depths):
+        return None
+    low, high = np.percentile(depths, POINT_PERCENTILES)
+    return DepthRange(
+        *_rounded(low * (1 - POINT_MARGIN), high * (1 + POINT_MARGIN)), "the points of the reconstruction"
+    )
+
+
+def _depths_of_silhouettes(views: Views) -> DepthRange | None:
+    """The depths of the visual hull, as far as enough views see it."""
+    silhouettes = find_silhouettes(views)
+    focus, depth = find_focus(views.cameras)
+    distance = float(np.median(depth))
+    if not silhouettes or distance <= 0:
+        return None
+    cell_size = 2 * distance / HULL_RESOLUTION
+    hull = carve(views, silhouettes, Box(focus, distance, cell_size), cell_size)
+    if hull is None:
+        return None
+    lowest, highest = _depths_of_hull(views.cameras, hull)
+    reach = np.sqrt(3) / 2 * cell_size  # of a cell around its center
+    near, far = max(lowest - reach, CAMERA_FACTORS[0] * distance), highest + reach
+    return DepthRange(*_rounded(near, far), "the silhouettes") if near < far else None
+
+
+def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[float, float]:
+    """Least and greatest depth, in the views that see them, of the centers of cells that enough views see."""
+    centers = hull.aabb_min + (np.argwhere(hull.cells) + 0.5) * hull.cell_size
+    depths = np.full((len(cameras), len(centers)), np.nan)
+    for i in range(len(cameras)):
+        coords, depth = (values.numpy() for values in cameras.project(i, torch.from_numpy(centers)))
+        size = np.array((int(cameras.height[i]), int(cameras.width[i])))
+        in_image = (depth > 0) & ((coords >= 0) & (coords <= size)).all(axis=1)
+        depths[i, in_image] = depth[in_image]
+    seen = (~np.isnan(depths)).sum(axis=0)
+    depths = depths[:, (seen > 0) & (seen >= MIN_SEEN * seen.max())]
+    return float(np.nanmin(depths, initial=np.inf)), float(np.nanmax(depths, initial=-np.inf))
+
+
+def _depths_of_cameras(views: Views) -> DepthRange | None:
+    """Multiples of the distance between the cameras and what they look at; None if their axes do not meet there."""
+    _, depth = find_focus(views.cameras)
+    distance = float(np.median(depth))
+    if len(views.cameras) < 2 or not distance > 0:
+        return None
+    near, far = (factor * distance for factor in CAMERA_FACTORS)
+    return DepthRange(*_rounded(near, far), "the cameras: 0.1 to 2 times as far as what they look at")
+
+
+def _depth(cameras: Cameras, camera: int, points: np.ndarray) -> np.ndarray:
+    """(m,) depth of points (m, 3) in one camera."""
+    return cameras.project(camera, torch.from_numpy(points))[1].numpy()
+
+
+def _rounded(near: float, far: float) -> tuple[float, float]:
+    """Four digits of each: what config.json and a flag can repeat."""
+    return float(f"{near:.4g}"), float(f"{far:.4g}")

@@ -1,0 +1,331 @@
+"""Captures as they should be: every format, the same rays; lenses against OpenCV; what is held out; masks; sizes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import capture_folder
+import cv2
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from capture_folder import (
+    COLUMN_STEP,
+    COUNT,
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    HEIGHT,
+    NAMES,
+    OPENCV,
+    PINHOLE,
+    ROW_STEP,
+    WIDTH,
+    Distortion,
+    picture,
+    points,
+    poses,
+    write_blender,
+    write_colmap,
+    write_images,
+    write_transforms,
+)
+
+from edge_se_sampler.data import memory
+from edge_se_sampler.data.capture import Capture
+from edge_se_sampler.data.colmap import read_colmap
+from edge_se_sampler.data.dataset import DataSettings, find_format, read_split
+from edge_se_sampler.data.lens import find_sources
+from edge_se_sampler.data.transforms import read_transforms
+from edge_se_sampler.data.views import Views
+from edge_se_sampler.errors import InputError
+
+HELD_OUT = [0, 8]
+
+
+def read(folder: Path, split: Any = "train", **settings: Any) -> Views:
+    views = read_split(folder, split, DataSettings(**settings))
+    assert views is not None
+    return views
+
+
+def project_by_opencv(distortion: Distortion, view: int, world: np.ndarray) -> np.ndarray:
+    """(m, 2) x, y where OpenCV sees points (m, 3), its pixels' centers being whole numbers."""
+    pose = poses()[view]
+    rotation = (pose[:3, :3] * (1, -1, -1)).T
+    turn, shift = cv2.Rodrigues(rotation)[0], -rotation @ pose[:3, 3]
+    matrix = np.array([[FX, 0, CX - 0.5], [0, FX if distortion.model == "RADIAL" else FY, CY - 0.5], [0, 0, 1]])
+    terms = np.array(list(distortion.terms.values()))
+    if distortion.model == "OPENCV_FISHEYE":
+        return cv2.fisheye.projectPoints(world[:, None], turn, shift, matrix, terms)[0][:, 0]
+    terms = np.concatenate((terms, np.zeros(2))) if distortion.model == "RADIAL" else terms
+    return cv2.projectPoints(world, turn, shift, matrix, terms if len(terms) else np.zeros(4))[0][:, 0]
+
+
+def write_and_list(folder: Path, kind: str, distortion: Distortion) -> Capture:
+    if kind == "transforms":
+        write_transforms(folder, distortion)
+        return read_transforms(folder)
+    write_colmap(folder, distortion, text=kind == "text")
+    return read_colmap(folder)
+
+
+@pytest.mark.parametrize("distortion", [OPENCV, FISHEYE, Distortion("RADIAL", {"k1": 0.1, "k2": -0.05})])
+@pytest.mark.parametrize("kind", ["transforms", "binary", "text"])
+def test_lenses_are_opencvs(kind: str, distortion: Distortion, tmp_path: Path) -> None:
+    """Where an undistorted pixel's ray goes, OpenCV sees the source of that pixel, to 1e-4 of one."""
+    frames = write_and_list(tmp_path, kind, distortion).frames
+    if distortion.model == "RADIAL" and kind == "transforms":
+        pytest.skip("a transforms.json states both focal lengths")
+    views = {split: read(tmp_path, split) for split in ("train", "test")}
+    for split, rows in (("test", HELD_OUT), ("train", [i for i in range(COUNT) if i not in HELD_OUT])):
+        for place, row in enumerate(rows):
+            rays = views[split].cameras.image_rays(place)
+            expected = project_by_opencv(distortion, row, (rays.origins + 3 * rays.directions).numpy())
+            sources, inside = find_sources(frames[row].camera, frames[row].pinhole, WIDTH, HEIGHT)
+            assert inside.all()  # the zoom has seen to it
+            np.testing.assert_allclose(sources.reshape(2, -1).T, expected, atol=1e-4)
+            shown = views[split].images[place].reshape(-1, 3)[:, :2] / (COLUMN_STEP, ROW_STEP)
+            middle = ((expected > 0) & (expected < (WIDTH - 1, HEIGHT - 1))).all(axis=1)
+            np.testing.assert_allclose(shown[middle], expected[middle], atol=0.13)  # 8 bits, and OpenCV's 1/32 pixel
+    assert views["train"].masks is None
+
+
+def test_every_format_gives_the_same_rays(tmp_path: Path) -> None:
+    write_blender(tmp_path / "blender")
+    write_transforms(tmp_path / "transforms")
+    write_colmap(tmp_path / "binary")
+    write_colmap(tmp_path / "text", text=True, sparse="sparse")
+    blender = read(tmp_path / "blender")
+    expected = [blender.subset(HELD_OUT), blender.subset([i for i in range(COUNT) if i not in HELD_OUT])]
+    for kind in ("transforms", "binary", "text"):
+        for split, views in zip(("val", "train"), expected, strict=True):
+            found = read(tmp_path / kind, split)
+            for image, other in zip(found.images, views.images, strict=True):
+                np.testing.assert_array_equal(image, other)
+            assert found.masks is None
+            for i in range(len(views.names)):
+                there, here = found.cameras.image_rays(i), views.cameras.image_rays(i)
+                torch.testing.assert_close(there.origins, here.origins, atol=1e-9, rtol=0)
+                torch.testing.assert_close(there.directions, here.directions, atol=1e-9, rtol=0)
+    seen = read(tmp_path / "binary").points
+    assert seen is not None
+    for points_of_view in seen:  # the first view, which is held out, sees none
+        np.testing.assert_array_equal(points_of_view, points())
+    text = read(tmp_path / "text", "test").points
+    assert text is not None
+    assert [len(own) for own in text] == [0, 30]
+
+
+def test_formats_are_told_by_what_the_folder_has(tmp_path: Path) -> None:
+    write_colmap(tmp_path, sparse="colmap/sparse/0")
+    assert find_format(tmp_path) == "colmap"
+    write_transforms(tmp_path)
+    assert find_format(tmp_path) == "transforms"
+    assert find_format(tmp_path, "colmap") == "colmap"
+    with pytest.raises(InputError, match="no scene in the format blender"):
+        find_format(tmp_path, "blender")
+    write_blender(tmp_path)
+    assert find_format(tmp_path) == "blender"
+
+
+def test_every_eighth_image_is_held_out_or_every_nth(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    held_out = [f"images/{name}" for name in (NAMES[0], NAMES[8])]
+    assert list(read(tmp_path, "test").names) == list(read(tmp_path, "val").names) == held_out
+    assert len(read(tmp_path).names) == 7
+    assert read(tmp_path).eval_every == 8
+    assert list(read(tmp_path, "test", eval_every=3).names) == [f"images/{NAMES[i]}" for i in (0, 3, 6)]
+
+
+def test_a_split_of_the_data(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    document |= {"train_filenames": [f"./images/{name}" for name in NAMES[:5]], "val_filenames": ["images/view 07"]}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert len(read(tmp_path).names) == 5
+    assert read(tmp_path, "val").names == ("images/view 07.png",)
+    assert read_split(tmp_path, "test") is None
+    assert read(tmp_path).eval_every is None
+    with pytest.raises(InputError, match="--eval-every has no effect"):
+        read(tmp_path, eval_every=4)
+    document["train_filenames"].append("images/view 07.png")
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"val_filenames\[0\]: .*in train_filenames, too"):
+        read(tmp_path)
+
+
+def test_images_that_do_not_exist_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_colmap(tmp_path)
+    for name in NAMES[:4]:
+        (tmp_path / "images" / name).unlink()
+    assert len(read(tmp_path).names) == 4  # of 5, of which the first is held out
+    assert capsys.readouterr().err.count("4 of the 9 listed images do not exist") == 1
+    (tmp_path / "images" / NAMES[4]).unlink()
+    with pytest.raises(InputError, match="5 of the 9 listed images do not exist"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["images_2", "images_4"])
+def test_scaled_images_scale_the_intrinsics(folder: str, tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    factor = int(folder[-1])
+    (tmp_path / folder).mkdir()
+    for i, name in enumerate(NAMES):
+        iio.imwrite(tmp_path / folder / name, picture(i)[::factor, ::factor])
+        (tmp_path / "images" / name).unlink()
+    (tmp_path / "images").rmdir()
+    cameras = read(tmp_path).cameras
+    values = [cameras.fx[0], cameras.fy[0], cameras.cx[0], cameras.cy[0]]
+    assert [float(value) * factor for value in values] == pytest.approx([FX, FY, CX, CY])
+    assert (int(cameras.width[0]), int(cameras.height[0])) == (WIDTH // factor, HEIGHT // factor)
+
+
+def half_mask() -> np.ndarray:
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, : WIDTH // 2] = 255
+    return mask
+
+
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+@pytest.mark.parametrize("distortion", [PINHOLE, OPENCV])
+def test_masks_of_both_meanings(kind: str, distortion: Distortion, tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    for name in NAMES:
+        iio.imwrite(tmp_path / "masks" / (f"{name}.png" if kind == "colmap" else name), half_mask())
+    if kind == "colmap":
+        write_colmap(tmp_path, distortion)
+    else:
+        document = write_transforms(tmp_path, distortion)
+        for frame, name in zip(document["frames"], NAMES, strict=True):
+            frame["mask_path"] = f"masks/{name}"
+        (tmp_path / "transforms.json").write_text(json.dumps(document))
+    ignored, objects = read(tmp_path), read(tmp_path, masks="object")
+    assert ignored.masks is not None
+    assert objects.masks is None
+    assert ignored.images[0].shape[2] == 3
+    if distortion is PINHOLE:
+        np.testing.assert_array_equal(ignored.masks[0], half_mask() > 0)
+        np.testing.assert_array_equal(objects.images[0][..., 3], half_mask())
+    left = WIDTH // 2 - 4
+    for i in range(7):
+        assert ignored.masks[i][:, :left].all()
+        assert not ignored.masks[i][:, left + 8 :].any()
+        np.testing.assert_array_equal(ignored.masks[i], objects.images[i][..., 3] == 255)
+    assert "masks (outside is unknown" in ignored.describe()
+    assert "alpha (transparent is background)" in objects.describe()
+    small = read(tmp_path, downscale=2)
+    assert small.masks is not None
+    assert small.images[0].shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert small.masks[0].shape == (HEIGHT // 2, WIDTH // 2)
+
+
+def test_masks_as_objects_where_there_are_none(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    with pytest.raises(InputError, match="neither masks nor alpha"):
+        read(tmp_path, masks="object")
+
+
+def test_rays_of_downscaled_images(tmp_path: Path) -> None:
+    """A pixel's ray passes the middle of those that it is the average of."""
+    write_colmap(tmp_path, OPENCV)
+    large, small = read(tmp_path), read(tmp_path, downscale=2)
+    coords = torch.tensor([[5.5, 7.5]], dtype=torch.float64)
+    first = torch.zeros((1, 1), dtype=torch.int64)
+    torch.testing.assert_close(
+        small.cameras.generate_rays(first, coords).directions, large.cameras.generate_rays(first, 2 * coords).directions
+    )
+    np.testing.assert_allclose(
+        small.images[0][5, 7], large.images[0][10:12, 14:16].mean(axis=(0, 1), dtype=np.float64), atol=0.51
+    )
+
+
+@pytest.mark.parametrize("suffix", ["", ".png"])
+def test_names_without_suffix(suffix: str, tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    for frame in document["frames"]:
+        frame["file_path"] = frame["file_path"].removesuffix(".png") + suffix
+    (tmp_path / "images" / NAMES[1]).rename(tmp_path / "images" / "view 01.JPG")  # by content it stays a PNG
+    document["frames"][1]["file_path"] = "images/view 01"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert len(read(tmp_path).names) == 7
+
+
+def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+    data = iio.imwrite("<bytes>", image, extension=".jpg", quality=100)
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
+
+
+@pytest.mark.parametrize(("orientation", "stored"), [
+    (6, lambda image: np.rot90(image)), (8, lambda image: np.rot90(image, -1)),
+    (5, lambda image: image.swapaxes(0, 1)), (7, lambda image: np.rot90(image, 2).swapaxes(0, 1)),
+])  # fmt: skip
+def test_orientations_are_applied_where_the_size_says_so(orientation: int, stored: Any, tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    for i, name in enumerate(NAMES):
+        write_turned(tmp_path / "images" / name, stored(picture(i)), orientation)
+    difference = read(tmp_path).images[0].astype(int) - picture(1)
+    assert np.abs(difference).mean() < 4  # JPEG's
+
+
+def test_orientations_that_the_camera_ignored(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    for i, name in enumerate(NAMES):
+        write_turned(tmp_path / "images" / name, picture(i), 6)
+    assert np.abs(read(tmp_path).images[0].astype(int) - picture(1)).mean() < 4
+
+
+def test_orientations_that_may_mean_either_are_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    write_turned(tmp_path / "images" / NAMES[3], picture(3), 3)
+    with pytest.raises(InputError, match=r"images\[3\]: .*EXIF orientation 3"):
+        read(tmp_path)
+
+
+def test_more_than_the_machine_has_is_refused_before_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_transforms(tmp_path)
+    monkeypatch.setattr(memory, "available_memory", lambda: 2 * 7 * (WIDTH // 3) * (HEIGHT // 3) * 3)
+    monkeypatch.setattr("edge_se_sampler.data.frames.read_image", None)  # would not be callable
+    with pytest.raises(InputError, match=r"transforms\.json: its 7 images take .*; give --downscale 3"):
+        read(tmp_path)
+
+
+def test_pixels_that_show_nothing_are_masked(tmp_path: Path) -> None:
+    """A principal point outside leaves no zoom at which all pixels show something."""
+    document = write_transforms(tmp_path, OPENCV) | {"cx": 70.0, "k1": 0.3}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    masks = read(tmp_path).masks
+    assert masks is not None
+    assert 0 < masks[0].mean() < 1
+
+
+def test_a_polynomial_that_turns_back_shows_no_pixel_twice(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path, Distortion("OPENCV", {"k1": -1.2}))
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    frame = read_transforms(tmp_path).frames[0]
+    sources, inside = find_sources(frame.camera, frame.pinhole, WIDTH, HEIGHT)
+    row = round(CY)
+    shown = np.diff(sources[0, row][inside[row]])
+    assert (shown > 0).all()
+
+
+def test_the_writer_of_models_is_right() -> None:
+    """Quaternions against OpenCV's own rotation."""
+    for motion, pose in zip(capture_folder.motions(), poses(), strict=True):
+        w, axis = motion[0], np.array(motion[1:4])
+        angle = 2 * np.arctan2(np.linalg.norm(axis), w)
+        rotation = cv2.Rodrigues(axis / np.linalg.norm(axis) * angle)[0]
+        np.testing.assert_allclose(rotation, (pose[:3, :3] * (1, -1, -1)).T, atol=1e-9)
+
+
+def test_images_may_lie_anywhere_in_the_folder(tmp_path: Path) -> None:
+    write_images(tmp_path / "a" / "b")
+    document = write_transforms(tmp_path)
+    document["frames"][0]["file_path"] = f"a/b/{NAMES[0]}"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert read(tmp_path, "test").names[0] == f"a/b/{NAMES[0]}"

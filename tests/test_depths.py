@@ -1,0 +1,105 @@
+"""Near and far from the scene: points, silhouettes, cameras; flags and NeRF's own scenes insist."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_folder import write_blender, write_colmap
+from tiny import ball_views
+
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.dataset import read_split
+from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.config import override
+from edge_se_sampler.engine.session import resolve_config
+from edge_se_sampler.methods import method_configs
+from edge_se_sampler.occupancy.depths import find_depths
+from edge_se_sampler.occupancy.hull import find_focus
+
+
+def moved(views: Views, scale: float, shift: tuple[float, float, float]) -> Views:
+    """The same images of a scene of another unit and origin, whose format says nothing of depths."""
+    poses = views.cameras.camera_to_worlds.numpy().copy()
+    poses[:, :, 3] = scale * poses[:, :, 3] + shift
+    c = views.cameras
+    cameras = Cameras.of(
+        poses, fx=c.fx[:, 0], fy=c.fy[:, 0], cx=c.cx[:, 0], cy=c.cy[:, 0], width=c.width[:, 0], height=c.height[:, 0]
+    )
+    return replace(views, cameras=cameras, depths=None)
+
+
+def opaque(views: Views) -> Views:
+    return replace(views, images=tuple(image[..., :3] for image in views.images))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01, 300.0])
+def test_silhouettes_of_a_ball(scale: float) -> None:
+    """The ball of radius 1, 4 away, in whatever units: nothing of it is cut off, and little is added."""
+    found = find_depths(moved(ball_views(16, 64), scale, (5.0, -70.0, 2.0)))
+    assert found.source == "the silhouettes"
+    assert 2.4 < found.near / scale <= 3
+    assert 5 <= found.far / scale < 5.6
+
+
+def test_what_few_cameras_see_does_not_count() -> None:
+    """Of twelve views one looks the other way, from far off: alone it carves nothing."""
+    views = moved(ball_views(12, 32), 1.0, (0.0, 0.0, 0.0))
+    poses = views.cameras.camera_to_worlds.clone()
+    poses[0, :, 3] *= 2.5
+    found = find_depths(replace(views, cameras=replace(views.cameras, camera_to_worlds=poses)))
+    assert 2.2 < found.near <= 3
+    assert found.far < 4 * 2.5 + 1.7  # where that camera sees the ball
+
+
+def test_points_decide_but_for_stray_ones() -> None:
+    views = opaque(moved(ball_views(12, 32), 1.0, (0.0, 0.0, 0.0)))
+    rng = np.random.default_rng(0)
+    surface = rng.normal(size=(1000, 3))
+    surface /= np.linalg.norm(surface, axis=1, keepdims=True)
+    surface[:2] = (1e4, 0, 0), (0, -1e4, 0)
+    found = find_depths(replace(views, points=(surface,) * 12))
+    assert found.source == "the points of the reconstruction"
+    assert 2.6 < found.near <= 3
+    assert 5 <= found.far < 5.6
+
+
+def test_cameras_alone() -> None:
+    found = find_depths(opaque(moved(ball_views(12, 32), 10.0, (1.0, 2.0, 3.0))))
+    assert (found.near, found.far) == pytest.approx((4, 80), rel=1e-3)
+    assert "cameras" in found.source
+
+
+def test_a_single_camera_or_parallel_ones_tell_nothing() -> None:
+    views = opaque(moved(ball_views(12, 32), 10.0, (0.0, 0.0, 0.0)))
+    assert "nothing else tells" in find_depths(views.subset([0])).source
+
+
+def test_focus() -> None:
+    focus, depth = find_focus(moved(ball_views(12, 32), 2.0, (1.0, 2.0, 3.0)).cameras)
+    np.testing.assert_allclose(focus, (1, 2, 3), atol=1e-9)
+    np.testing.assert_allclose(depth, 8, atol=1e-9)
+
+
+def test_nerfs_own_scenes_keep_2_and_6(scene: Path, tmp_path: Path) -> None:
+    """Their json has an angle of view; real folders of that format state focal lengths."""
+    assert read_blender(scene, "train").depths == (2.0, 6.0)
+    write_blender(tmp_path / "real")
+    assert read_blender(tmp_path / "real", "train").depths is None
+
+
+def test_the_config_records_depths_and_flags_insist(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    views = read_split(tmp_path, "train")
+    assert views is not None
+    config = method_configs()["lean-nerf"]
+    resolved = resolve_config(config, views)
+    model = resolved.pipeline.model
+    assert (model.near, model.far) == (find_depths(views).near, find_depths(views).far)
+    assert (resolved.data_format, resolved.eval_every) == ("colmap", 8)
+    assert resolve_config(resolved, views) == resolved
+    given = resolve_config(override(config, {"pipeline.model.near": 0.5}), views).pipeline.model
+    assert (given.near, given.far) == (0.5, model.far)
