@@ -295,14 +295,18 @@ def test_a_supersampled_pixel_is_the_mean_of_its_quarters() -> None:
     assert pixels["depth_fine"].shape == (50, 1)
 
 
-@pytest.mark.parametrize(("num_pixels", "begin"), [(0, 30), (64 * 40 // 4, 40), (64 * 60 // 4, None)])
-def test_a_pixel_has_more_rays_at_last_if_all_were_trained_on_often_enough(num_pixels: int, begin: int | None) -> None:
-    """From 0.6 of the training on; a step has as many rays as before."""
-    trainer = tiny_trainer(config_of(50), VIEWS)
+@pytest.mark.parametrize(
+    ("supersample", "visits", "begin"), [(True, 1000.0, 30), (True, 5.0, 40), (True, 3.0, None), (False, 1000.0, None)]
+)
+def test_a_pixel_has_more_rays_at_last_if_all_were_trained_on_often_enough(
+    supersample: bool, visits: float, begin: int | None
+) -> None:
+    """From 0.6 of the training on; a step has as many rays as before. `visits`: of a pixel in 50 steps."""
+    trainer = tiny_trainer(config_of(50, supersample=supersample), VIEWS)
     model, sampler = trainer.pipeline.model, trainer.pipeline.datamanager.train_pixel_sampler
     supersampled = []
     for step in range(50):
-        model.grid.num_pixels.fill_(num_pixels)
+        model.grid.num_pixels.fill_(round(50 * 64 / visits))
         trainer.train_iteration(step)
         supersampled.append(bool(model.supersampled))
         assert sampler.num_rays_per_batch == (16 if supersampled[-1] else 64)

@@ -37,7 +37,9 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     views, device = read_train_views(config), choose_device(config.machine.device_type)
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else to_pictures(held_out)[0]
+    began = time.monotonic()
     config = resolve_config(config, views)
+    setup_seconds = time.monotonic() - began
     if isinstance(config.pipeline.model, LeanModelConfig):
         compile_ops(device)
     else:
@@ -45,7 +47,8 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
     run = run or RunFolder.create(config)
-    return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=time.monotonic() - began)
+    setup_seconds += time.monotonic() - began
+    return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
 
 
 def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:

@@ -224,7 +224,7 @@ class LeanModel(RayModel):
 
         def update_rays(step: int) -> None:
             if trainer.progress(step) >= SUPERSAMPLING_START and visits(step) >= MIN_VISITS:
-                self.supersampled.fill_(True)
+                self.supersampled.fill_(self.config.supersample)
             if self.supersampled:
                 sampler.set_num_rays_per_batch(max(1, num_rays // 4))
 

@@ -24,6 +24,7 @@ from edge_se_sampler.methods import method_configs
 VARIANTS: dict[str, dict[str, Any]] = {
     "lean-nerf": {},
     "uniform pixels": {f"{SAMPLER}.late": "uniform", f"{SAMPLER}.error_source": "fine"},
+    "one ray a pixel": {f"{MODEL}.supersample": False},
     "no hull": {f"{MODEL}.cull_by_alpha": False},
     "no total variation": {f"{MODEL}.total_variation": 0.0},
     "no alpha loss": {f"{MODEL}.alpha_loss": 0.0},
