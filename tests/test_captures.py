@@ -35,6 +35,7 @@ from capture_folder import (
     write_images,
     write_transforms,
 )
+from tiny import SMALL
 
 from edge_se_sampler.data import memory
 from edge_se_sampler.data.capture import Capture
@@ -312,6 +313,36 @@ def test_a_polynomial_that_turns_back_shows_no_pixel_twice(tmp_path: Path) -> No
     row = round(CY)
     shown = np.diff(sources[0, row][inside[row]])
     assert (shown > 0).all()
+
+
+def test_transparent_colors_do_not_show_between_pixels(tmp_path: Path) -> None:
+    """Red in front of transparent green stays red where the lens's image falls between both."""
+    write_colmap(tmp_path, OPENCV)
+    image = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    image[...] = (0, 255, 0, 0)
+    image[8:25, 9:30] = (255, 0, 0, 255)
+    for name in NAMES:
+        iio.imwrite(tmp_path / "images" / name, image)
+    shown = read(tmp_path).images[0]
+    partly = (shown[..., 3] > 0) & (shown[..., 3] < 255)
+    assert partly.sum() > 20
+    assert (shown[shown[..., 3] > 0][:, :3] == (255, 0, 0)).all()
+
+
+def test_a_run_records_what_is_held_out_and_eval_uses_the_same(tmp_path: Path, edge_se: Any) -> None:
+    write_colmap(tmp_path / "mug", OPENCV)
+    flags = ("--data", tmp_path / "mug", "--eval-every", 3, "--output-dir", tmp_path / "outputs", *SMALL)
+    answer = edge_se("train", "vanilla-nerf", *flags)
+    assert answer.code == 0, answer.err
+    assert "data     colmap: 6 views of 48 x 36, every 3rd image held out; no masks" in answer.out
+    (run,) = (tmp_path / "outputs/mug/vanilla-nerf").iterdir()
+    config = json.loads((run / "config.json").read_text())
+    near, far = config["pipeline"]["model"]["near"], config["pipeline"]["model"]["far"]
+    assert (config["data_format"], config["eval_every"]) == ("colmap", 3)
+    assert f"depths   {near:g} to {far:g}" in answer.out
+    assert edge_se("eval", run, "--output-path", tmp_path / "eval.json").code == 0
+    images = json.loads((tmp_path / "eval.json").read_text())["results"]["images"]
+    assert [image["name"] for image in images] == [NAMES[0], NAMES[3], NAMES[6]]
 
 
 def test_the_writer_of_models_is_right() -> None:

@@ -18,6 +18,8 @@ import numpy as np
 
 NUM_RADII = 2000
 """At which a polynomial is looked at for where it turns back."""
+ROWS_AT_ONCE = 64
+"""Of an image, whose sources are found."""
 MIN_ZOOM, MAX_ZOOM = 0.5, 2.0
 """Of a pinhole's focal lengths, in those of the lens whose image it shows."""
 
@@ -83,9 +85,15 @@ def find_sources(camera: Intrinsics, pinhole: Intrinsics, width: int, height: in
 
     Returns:
         x, y (2, H, W) float32 in OpenCV's pixels, whose centers are whole numbers; (H, W) bool: whether that is in the
-        image and shown nowhere else.
+        image and shown nowhere else; where it is not, x and y are 0.
     """
-    return _locate(camera, pinhole, width, height, np.arange(width)[None], np.arange(height)[:, None])
+    sources, inside = np.zeros((2, height, width), dtype=np.float32), np.zeros((height, width), dtype=bool)
+    for start in range(0, height, ROWS_AT_ONCE):  # in float64 all rows would take many times the image's memory
+        rows = slice(start, min(start + ROWS_AT_ONCE, height))
+        y = np.arange(rows.start, rows.stop)[:, None]
+        found, inside[rows] = _locate(camera, pinhole, width, height, np.arange(width)[None], y)
+        sources[:, rows] = np.where(inside[rows], found, 0)
+    return sources, inside
 
 
 def _locate(
@@ -109,7 +117,7 @@ def _locate(
         shown_x, shown_y = camera.fx * shown_u + camera.cx - 0.5, camera.fy * shown_v + camera.cy - 0.5
         inside = (shown_x >= -0.5) & (shown_x <= width - 0.5) & (shown_y >= -0.5) & (shown_y <= height - 0.5)
         inside &= square <= _largest_radius(camera.lens, float(np.sqrt(square.max()))) ** 2
-        return np.stack((shown_x, shown_y)).astype(np.float32), inside
+        return np.stack((shown_x, shown_y)), inside
 
 
 def _polynomial(k: Sequence[float], square: np.ndarray) -> np.ndarray:
@@ -118,7 +126,7 @@ def _polynomial(k: Sequence[float], square: np.ndarray) -> np.ndarray:
 
 
 def _largest_radius(lens: Lens, largest: float) -> float:
-    """The r, at most `largest`, up to which a point that is farther out is shown farther out."""
+    """The r up to which a point that is farther out is shown farther out; infinity if that is beyond `largest`."""
     r = np.linspace(0, largest, NUM_RADII)
     if lens.fisheye:
         angle, k = np.arctan(r), lens.coefficients
@@ -126,13 +134,13 @@ def _largest_radius(lens: Lens, largest: float) -> float:
         angle, k = r, (*lens.coefficients[:2], lens.coefficients[4])
     shown = angle * _polynomial(k, angle * angle)
     turns = np.flatnonzero(~(np.diff(shown) > 0))
-    return float(r[turns[0]]) if len(turns) else largest
+    return float(r[turns[0]]) if len(turns) else np.inf
 
 
 def undistort(values: np.ndarray, sources: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """(H, W) or (H, W, 3|4) uint8, the last one's alpha straight, as a pinhole would have seen it, between pixels by
     bilinear interpolation; 0 where nothing is shown. Colors are interpolated premultiplied by alpha."""
-    x, y = np.where(inside, sources, 0).astype(np.float32)
+    x, y = sources
     if values.ndim == 3 and values.shape[2] == 4:
         alpha = values[..., 3:].astype(np.float32)
         layers = np.concatenate((values[..., :3] * alpha, alpha), axis=2)

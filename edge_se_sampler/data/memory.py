@@ -11,7 +11,7 @@ from edge_se_sampler.data.scene_file import SourceLocation
 
 COPIES = 2
 """Of all pixels: training stacks the images of one size."""
-BYTES_AT_WORK = 40
+BYTES_AT_WORK = 60
 """Of a pixel of an image that is undistorted and averaged, at most: colors and where they come from, in float32."""
 MEMORY_AT_WORK = 3 * 2**29
 """Bytes of all images that are decoded at the same time."""

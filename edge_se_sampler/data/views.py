@@ -45,6 +45,7 @@ class Views:
         alpha = any(image.shape[2] == 4 for image in self.images)
         meanings = ["alpha (transparent is background)"] * alpha
         meanings += ["masks (outside is unknown, and not trained on)"] * (self.masks is not None)
-        held_out = f", every {self.eval_every}th image held out" if self.eval_every else ""
+        ordinal = {2: "nd", 3: "rd"}.get(self.eval_every or 0, "th")
+        held_out = f", every {self.eval_every}{ordinal} image held out" if self.eval_every else ""
         source = f"{self.data_format}: " if self.data_format else ""
         return f"{source}{len(self.images)} views of {sizes}{held_out}; {' and '.join(meanings) or 'no masks'}"
