@@ -37,9 +37,9 @@ def read_blender(
     top = read_json(transforms_path(folder, split))
     entries = read_entries(top, folder)
     views = load_views(read_frames(entries), settings, progress)
-    # scenes that state focal lengths in pixels are real ones, whose units are their own
-    real = any("fl_x" in entry.intrinsics for entry in entries)
-    return replace(views, depths=None if real else NERF_SYNTHETIC_DEPTHS, data_format="blender")
+    # real scenes, whose units are their own, state focal lengths in pixels alone
+    depths = NERF_SYNTHETIC_DEPTHS if "camera_angle_x" in top.object() else None
+    return replace(views, depths=depths, data_format="blender")
 
 
 def _check_split(folder: Path, split: str) -> None:
