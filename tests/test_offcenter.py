@@ -74,6 +74,11 @@ class TestPixels:
                     found = iio.imread(folder / split / f"r_{i}.png")
                     np.testing.assert_array_equal(found, on_canvas(pixels(i), *size, *corner), strict=True)
 
+    def test_copies_of_nerfs_scenes_keep_its_depths(self, tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene")
+        copies = [copy for copy, _ in copies_of(tmp_path / "scene")]
+        assert [read_blender(copy, "train").depths for copy in copies] == [(2.0, 6.0)] * 2
+
     def test_the_default_shift_is_the_synthetic_scenes_offset(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene", n=1)
         iio.imwrite(tmp_path / "scene/train/r_0.png", pixels(0, 20, 20))
