@@ -218,6 +218,22 @@ def test_a_grid_that_would_be_empty_is_an_error() -> None:
         model.update_cells(0.26, 0.3, 0.5)
 
 
+def test_a_training_that_sees_nothing_at_all_is_an_error() -> None:
+    """Not an empty image at its end."""
+    model = full_model()
+    assert not model.update_cells(0.19, 0.21, 0.21)  # the level has just ended
+    with pytest.raises(FloatingPointError, match="no cell has anything"):
+        model.update_cells(0.21, 0.22, 0.22)
+
+
+@pytest.mark.parametrize("size", [8, 64])
+def test_the_first_fog_is_sampled_however_many_cells_a_box_has(size: int) -> None:
+    model = full_model(torch.ones((size, size, size), dtype=torch.bool))
+    assert float(model.density.min()) >= model.marching.density_min
+    rendered = render_outputs(model, tiny_rays(100, dtype=torch.float32), ["accumulation_fine"])["accumulation_fine"]
+    assert 0.2 < float(rendered.max()) < 0.99
+
+
 def test_cells_are_subdivided_only_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second time they would be too many."""
     monkeypatch.setattr(lean, "ROWS_PER_SEEN", 100)

@@ -46,6 +46,8 @@ SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
 more rays tell more of what is smaller than a pixel, but other pixels tell more of what is not yet known."""
 STEPS_PER_SAMPLED = 50
 """Steps after which cells that have become transparent are found again."""
+FOG_MARGIN = 0.3
+"""How much more raw density than what is seen training begins with, where all of a box may be occupied."""
 TRANSPARENT_MARGIN = 0.7
 """How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
 ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.2, 1.5
@@ -135,7 +137,9 @@ class LeanModel(RayModel):
         self.fine = ColorNetwork(rng)
         uncarved = grid.occupied.sum() > 0.9 * grid.size.prod()
         across = float(grid.size.max()) * 2 ** int(grid.max_level)
-        raw = -math.log(across) if uncarved else INITIAL_RAW_DENSITY  # an uncarved box: optical depth 1 across
+        # an uncarved box: optical depth 1 across, or more where samples of so little opacity would be left out
+        thin = max(-math.log(across), self.marching.density_min + FOG_MARGIN)
+        raw = thin if uncarved else INITIAL_RAW_DENSITY
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
         draws = rng.standard_normal((grid.num_rows, FEATURE_DIM), dtype=np.float32) * np.float32(0.01)
         self.features = nn.Parameter(torch.from_numpy(draws))
@@ -242,11 +246,13 @@ class LeanModel(RayModel):
     @torch.no_grad()
     def update_cells(self, before: float, now: float, done: float) -> bool:
         """Do what is due as cells go on from one part of their training to the next, when a part `done`, in (0, 1), of
-        the whole training is behind them; tells whether they were subdivided."""
+        the whole training is behind them; tells whether they were subdivided. FloatingPointError: they hold nothing."""
         grid = self.grid
         begin, end = self._level_span()
         if before < begin + UNSETTLED * (end - begin) <= now:
             grid.reset_max_weight()
+        if grid.level < grid.max_level and before >= end and not grid.num_seen:
+            raise _nothing_seen()
         # before that many weights are seen, nobody knows which cells are empty
         if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
             return self._subdivide((1 - done) / done)
@@ -268,7 +274,7 @@ class LeanModel(RayModel):
         """(X, Y, Z) bool: cells that had a weight in some color. FloatingPointError: there are none."""
         seen = self.grid.occupied.reshape(-1) & (self.grid.max_weight > self.config.prune_weight)
         if not seen.any():
-            raise FloatingPointError("no cell has anything in it any more; try a lower --optimizer.lr, or a longer run")
+            raise _nothing_seen()
         return self.grid.to_cells(seen)
 
     def _subdivide(self, remaining: float) -> bool:
@@ -311,3 +317,7 @@ class LeanModel(RayModel):
             ratio = better
             finer = grid.subdivide(kept, ratio * float(grid.cell_size))
         return finer
+
+
+def _nothing_seen() -> FloatingPointError:
+    return FloatingPointError("no cell has anything in it any more; try a lower --optimizer.lr, or a longer run")
