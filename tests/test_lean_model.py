@@ -45,7 +45,6 @@ def full_model(cells: torch.Tensor | None = None, max_level: int = 2, num_pixels
 
 def test_training_learns_the_ball_in_ever_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean, "ROWS_PER_SEEN", 100)  # few rays are trained on
-    monkeypatch.setattr(lean, "MAX_VISITS", 1000)
     trainer = tiny_trainer(config_of(300), VIEWS)
     model = trainer.pipeline.model
     sizes, losses = [], []
@@ -57,20 +56,6 @@ def test_training_learns_the_ball_in_ever_smaller_cells(monkeypatch: pytest.Monk
     assert sizes[0] == pytest.approx(2 * sizes[100])
     assert 2.5 * sizes[-1] < sizes[0] <= 8 * sizes[-1]
     assert np.mean(losses[-20:]) < 0.1 * np.mean(losses[:20])
-
-
-def test_in_a_long_training_cells_are_subdivided_when_pixels_were_trained_on_often_enough(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """As if it ended with that."""
-    trainer = tiny_trainer(config_of(3000), VIEWS)
-    model = trainer.pipeline.model
-    monkeypatch.setattr(lean, "MAX_VISITS", 300 * 64 / int(model.grid.num_pixels))
-    levels = []
-    for step in range(150):
-        trainer.train_iteration(step)
-        levels.append(int(model.grid.level))
-    assert [levels.count(level) for level in range(3)] == [61, 74, 15]
 
 
 def show_all(model: LeanModel, times: int = 1) -> None:
@@ -102,7 +87,7 @@ def test_cells_without_weight_are_left_out_when_cells_are_subdivided() -> None:
     rows = torch.nonzero(model.grid.occupied.reshape(-1))[:, 0]
     in_corner = torch.stack([model.grid.to_cells(torch.arange(model.grid.num_rows) == row)[seen].any() for row in rows])
     model.grid.max_weight.zero_()[rows] = in_corner.float()
-    model.update_cells(0.26, 0.28, 0.28)
+    model.update_cells(0.26, 0.28)
     grid = model.grid
     assert int(grid.level) == 1
     expected = torch.zeros((16, 16, 16), dtype=torch.bool)
@@ -119,7 +104,7 @@ def test_cells_are_halved_and_become_at_last_as_small_as_what_was_seen_allows(ma
         model = full_model(max_level=max_level)
         allowed = lean.ROWS_PER_SEEN * times * model.grid.num_rows
         show_all(model, times)
-        model.update_cells(0.5, 0.6, 0.5)
+        model.update_cells(0.4, 0.5)
         sizes.append(float(model.grid.cell_size) / 0.25)
         assert int(model.grid.level) == 1
         assert sizes[-1] in (0.5, smallest) or model.grid.num_rows == pytest.approx(allowed, rel=0.3)
@@ -133,7 +118,7 @@ def test_there_are_no_more_corners_than_pixels_can_tell(num_pixels: int) -> None
     """But cells are halved all the same."""
     model = full_model(max_level=1, num_pixels=num_pixels)
     show_all(model, 10_000)
-    model.update_cells(0.4, 0.5, 0.5)
+    model.update_cells(0.4, 0.5)
     if num_pixels == 100:
         assert float(model.grid.cell_size) == 0.25 / 2
     else:
@@ -149,7 +134,7 @@ def test_subdividing_changes_little_of_what_is_rendered() -> None:
     rays = tiny_rays(200, dtype=torch.float32)
     before = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
     show_all(model)
-    model.update_cells(0.59, 0.61, 0.5)
+    model.update_cells(0.59, 0.61)
     assert float(model.grid.cell_size) == 0.25 / 2
     assert int(model.grid.level) == 1
     after = render_outputs(model, rays, ["rgb_fine", "accumulation_fine"])
@@ -161,19 +146,19 @@ def test_subdividing_changes_little_of_what_is_rendered() -> None:
 def test_cells_are_not_subdivided_before_enough_was_seen() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(511), torch.ones(511))  # of 512 cells
-    model.update_cells(0.26, 0.3, 0.5)
+    model.update_cells(0.26, 0.3)
     assert int(model.grid.level) == 0
     model.grid.update_max_weight(torch.arange(1), torch.ones(1))
-    model.update_cells(0.3, 0.31, 0.5)
+    model.update_cells(0.3, 0.31)
     assert int(model.grid.level) == 1
 
 
 def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(512), torch.ones(512))
-    model.update_cells(0.07, 0.08, 0.5)
+    model.update_cells(0.07, 0.08)
     assert model.grid.max_weight.any()
-    model.update_cells(0.08, 0.082, 0.5)  # 0.4 of 0.2025
+    model.update_cells(0.08, 0.082)  # 0.4 of 0.2025
     assert not model.grid.max_weight.any()
 
 
@@ -215,15 +200,15 @@ def test_a_grid_that_would_be_empty_is_an_error() -> None:
     model = full_model()
     model.grid.update_max_weight(torch.arange(512), torch.full((512,), 0.001))
     with pytest.raises(FloatingPointError, match=r"no cell has anything.*--optimizer\.lr"):
-        model.update_cells(0.26, 0.3, 0.5)
+        model.update_cells(0.26, 0.3)
 
 
 def test_a_training_that_sees_nothing_at_all_is_an_error() -> None:
     """Not an empty image at its end."""
     model = full_model()
-    assert not model.update_cells(0.19, 0.21, 0.21)  # the level has just ended
+    assert not model.update_cells(0.19, 0.21)  # the level has just ended
     with pytest.raises(FloatingPointError, match="no cell has anything"):
-        model.update_cells(0.21, 0.22, 0.22)
+        model.update_cells(0.21, 0.22)
 
 
 @pytest.mark.parametrize("size", [8, 64])

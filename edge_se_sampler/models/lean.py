@@ -36,9 +36,6 @@ INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
 """Denser than the maximum is as opaque, and slow to become transparent again."""
 LAST_SUBDIVISION, LEVEL_RATIO = 0.45, 0.45
 """Part of the training after which the finest level begins, and by which each level ends before the next one does."""
-MAX_VISITS = 3.5
-"""Cells are subdivided as if the training would end when each pixel has been trained on so often: the larger ones learn
-no more by then."""
 UNSETTLED = 0.4
 """Part of a level whose weights are not looked at when cells are pruned: they still move."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
@@ -235,8 +232,7 @@ class LeanModel(RayModel):
         def update_cells(step: int) -> None:
             if step % STEPS_PER_SAMPLED == 0:
                 self.update_sampled()
-            before, now = (max(trainer.progress(i), visits(i) / MAX_VISITS) for i in (max(step - 1, 0), step))
-            if self.update_cells(before, now, trainer.progress(step)):
+            if self.update_cells(trainer.progress(step - 1) if step else 0.0, trainer.progress(step)):
                 for parameter in (self.density, self.features):
                     trainer.optimizer.state.pop(parameter, None)
 
@@ -244,9 +240,9 @@ class LeanModel(RayModel):
         return [TrainingCallback(before, update) for update in (update_rays, update_cells)]
 
     @torch.no_grad()
-    def update_cells(self, before: float, now: float, done: float) -> bool:
-        """Do what is due as cells go on from one part of their training to the next, when a part `done`, in (0, 1), of
-        the whole training is behind them; tells whether they were subdivided. FloatingPointError: they hold nothing."""
+    def update_cells(self, before: float, now: float) -> bool:
+        """Do what is due as training goes on from one part of it to the next, both in [0, 1]; tells whether cells were
+        subdivided. FloatingPointError: they hold nothing."""
         grid = self.grid
         begin, end = self._level_span()
         if before < begin + UNSETTLED * (end - begin) <= now:
@@ -255,7 +251,7 @@ class LeanModel(RayModel):
             raise _nothing_seen()
         # before that many weights are seen, nobody knows which cells are empty
         if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
-            return self._subdivide((1 - done) / done)
+            return self._subdivide((1 - now) / now)
         return False
 
     @torch.no_grad()
@@ -265,7 +261,7 @@ class LeanModel(RayModel):
         self.grid.set_sampled(choose_ops(self.density).find_dense_cells(self.grid, self.density, least))
 
     def _level_span(self) -> tuple[float, float]:
-        """Parts of the cells' training at which the grid's level begins and ends."""
+        """Parts of the training at which the grid's level begins and ends."""
         remaining = int(self.grid.max_level - self.grid.level)
         begin, end = (LAST_SUBDIVISION * LEVEL_RATIO ** (levels - 1) for levels in (remaining + 1, remaining))
         return begin if self.grid.level else 0.0, end if remaining else 1.0
