@@ -18,14 +18,15 @@ Key = tuple[str, int, str]
 
 
 def describe(folder: Path) -> str:
-    """The README.md of a folder with a result.json."""
-    result = read_result(folder / "result.json")
+    """The README.md of a folder with a result.json; notes.md has remarks by hand, which no number shows."""
+    result, notes = read_result(folder / "result.json"), folder / "notes.md"
     runs = [run for run in result["runs"] if run["variant"] == BASELINE]
     return fill_template(
         __file__,
         folder,
         test_views=TEST_VIEWS,
         psnr=_table_of_psnr(runs),
+        notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
         gaps=_table_of(runs, {"test": "psnr", "SSIM": "ssim", "validation": "val_psnr", "training": "train_psnr"}),
         costs=_table_of_costs(runs),
         variants=_table_of_variants(result["runs"]),
