@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -76,13 +77,16 @@ def write_and_list(folder: Path, kind: str, distortion: Distortion) -> Capture:
     return read_colmap(folder)
 
 
-@pytest.mark.parametrize("distortion", [OPENCV, FISHEYE, Distortion("RADIAL", {"k1": 0.1, "k2": -0.05})])
-@pytest.mark.parametrize("kind", ["transforms", "binary", "text"])
+RADIAL = Distortion("RADIAL", {"k1": 0.1, "k2": -0.05})  # of COLMAP: a transforms.json states both focal lengths
+
+
+@pytest.mark.parametrize(
+    ("kind", "distortion"),
+    [*product(("transforms", "binary", "text"), (OPENCV, FISHEYE)), ("binary", RADIAL), ("text", RADIAL)],
+)
 def test_lenses_are_opencvs(kind: str, distortion: Distortion, tmp_path: Path) -> None:
     """Where an undistorted pixel's ray goes, OpenCV sees the source of that pixel, to 1e-4 of one."""
     frames = write_and_list(tmp_path, kind, distortion).frames
-    if distortion.model == "RADIAL" and kind == "transforms":
-        pytest.skip("a transforms.json states both focal lengths")
     views = {split: read(tmp_path, split) for split in ("train", "test")}
     for split, rows in (("test", HELD_OUT), ("train", [i for i in range(COUNT) if i not in HELD_OUT])):
         for place, row in enumerate(rows):

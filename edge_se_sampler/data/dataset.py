@@ -24,7 +24,7 @@ CONTENTS = {
     "transforms": "transforms.json",
     "colmap": "sparse/0, sparse or colmap/sparse/0 with cameras, images and points3D",
 }
-"""By what each is told."""
+"""Files by which each format is recognized."""
 
 
 @dataclass(frozen=True)

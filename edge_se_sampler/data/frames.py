@@ -23,7 +23,7 @@ from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
 Progress = Callable[[int, int], None]
-"""Is told how many of how many images are read."""
+"""Called with the number of images read so far, and of all."""
 MAX_REMAPPED = 2**15 - 2
 """Pixels, of a side: OpenCV undistorts no larger images."""
 

@@ -1,4 +1,4 @@
-"""Whether the images of a scene fit the machine's memory, told before any is decoded."""
+"""Whether the images of a scene fit the machine's memory, estimated before any is decoded."""
 
 from __future__ import annotations
 

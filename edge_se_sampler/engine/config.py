@@ -68,7 +68,7 @@ class TrainerConfig(InstantiateConfig):
     method_name: Annotated[str, tyro.conf.Suppress] = "edge-se-nerf"
     """Name of the method, part of the run folder's path."""
     data: Path | None = None
-    """The folder to train on: images, and their cameras in a format that it is told by."""
+    """The folder to train on: images, and a file of their cameras."""
     data_format: DataFormat = "auto"
     """Format of the folder: NeRF's Blender scenes (transforms_train.json and so on), one transforms.json (nerfstudio,
     instant-ngp), or COLMAP's sparse model; auto: the first of these that it has."""

@@ -63,7 +63,7 @@ def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
 
 
 def resolve_depths(views: Views, config: Model) -> tuple[Model, str]:
-    """The config with near and far, where they are left out, from the training views, and what told them."""
+    """The config with near and far, where they are left out, from the training views, and their source."""
     if config.near is not None and config.far is not None:
         return config, "as set"
     found = find_depths(views)

@@ -38,7 +38,7 @@ class DepthRange:
     near: float
     far: float
     source: str
-    """What tells."""
+    """What they were derived from."""
 
 
 def find_depths(views: Views) -> DepthRange:
