@@ -11,6 +11,9 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
+from edge_se_sampler.data.dataset import DataSettings, read_split
+from edge_se_sampler.data.views import Views
+
 WIDTH, HEIGHT, COUNT = 48, 36, 9
 FX, FY, CX, CY = 40.0, 42.0, 23.0, 19.5
 NAMES = [f"view {i:02d}.png" for i in range(COUNT)]
@@ -153,3 +156,9 @@ def write_colmap(
     for name, data in files.items():
         (folder / sparse / name).write_bytes(data)
     return files
+
+
+def read(folder: Path, split: Any = "train", **settings: Any) -> Views:
+    views = read_split(folder, split, DataSettings(**settings))
+    assert views is not None
+    return views

@@ -1,4 +1,4 @@
-"""Captures as they should be: every format, the same rays; lenses against OpenCV; what is held out; masks; sizes."""
+"""Captures as they should be: every format, the same rays; lenses against OpenCV; lists, and what is held out."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from capture_folder import (
     HEIGHT,
     NAMES,
     OPENCV,
-    PINHOLE,
     ROW_STEP,
     WIDTH,
     Distortion,
     picture,
     points,
     poses,
+    read,
     write_blender,
     write_colmap,
     write_images,
@@ -38,22 +38,14 @@ from capture_folder import (
 )
 from tiny import SMALL
 
-from edge_se_sampler.data import memory
 from edge_se_sampler.data.capture import Capture
 from edge_se_sampler.data.colmap import read_colmap
-from edge_se_sampler.data.dataset import DataSettings, find_format, read_split
+from edge_se_sampler.data.dataset import find_format, read_split
 from edge_se_sampler.data.lens import find_sources
 from edge_se_sampler.data.transforms import read_transforms
-from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
 HELD_OUT = [0, 8]
-
-
-def read(folder: Path, split: Any = "train", **settings: Any) -> Views:
-    views = read_split(folder, split, DataSettings(**settings))
-    assert views is not None
-    return views
 
 
 def project_by_opencv(distortion: Distortion, view: int, world: np.ndarray) -> np.ndarray:
@@ -190,65 +182,6 @@ def test_scaled_images_scale_the_intrinsics(folder: str, tmp_path: Path) -> None
     assert (int(cameras.width[0]), int(cameras.height[0])) == (WIDTH // factor, HEIGHT // factor)
 
 
-def half_mask() -> np.ndarray:
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[:, : WIDTH // 2] = 255
-    return mask
-
-
-@pytest.mark.parametrize("kind", ["transforms", "colmap"])
-@pytest.mark.parametrize("distortion", [PINHOLE, OPENCV])
-def test_masks_of_both_meanings(kind: str, distortion: Distortion, tmp_path: Path) -> None:
-    (tmp_path / "masks").mkdir()
-    for name in NAMES:
-        iio.imwrite(tmp_path / "masks" / (f"{name}.png" if kind == "colmap" else name), half_mask())
-    if kind == "colmap":
-        write_colmap(tmp_path, distortion)
-    else:
-        document = write_transforms(tmp_path, distortion)
-        for frame, name in zip(document["frames"], NAMES, strict=True):
-            frame["mask_path"] = f"masks/{name}"
-        (tmp_path / "transforms.json").write_text(json.dumps(document))
-    ignored, objects = read(tmp_path), read(tmp_path, masks="object")
-    assert ignored.masks is not None
-    assert objects.masks is None
-    assert ignored.images[0].shape[2] == 3
-    if distortion is PINHOLE:
-        np.testing.assert_array_equal(ignored.masks[0], half_mask() > 0)
-        np.testing.assert_array_equal(objects.images[0][..., 3], half_mask())
-    left = WIDTH // 2 - 4
-    for i in range(7):
-        assert ignored.masks[i][:, :left].all()
-        assert not ignored.masks[i][:, left + 8 :].any()
-        np.testing.assert_array_equal(ignored.masks[i], objects.images[i][..., 3] == 255)
-    assert "masks (outside is unknown" in ignored.describe()
-    assert "alpha (transparent is background)" in objects.describe()
-    small = read(tmp_path, downscale=2)
-    assert small.masks is not None
-    assert small.images[0].shape == (HEIGHT // 2, WIDTH // 2, 3)
-    assert small.masks[0].shape == (HEIGHT // 2, WIDTH // 2)
-
-
-def test_masks_as_objects_where_there_are_none(tmp_path: Path) -> None:
-    write_transforms(tmp_path)
-    with pytest.raises(InputError, match="neither masks nor alpha"):
-        read(tmp_path, masks="object")
-
-
-def test_rays_of_downscaled_images(tmp_path: Path) -> None:
-    """A pixel's ray passes the middle of those that it is the average of."""
-    write_colmap(tmp_path, OPENCV)
-    large, small = read(tmp_path), read(tmp_path, downscale=2)
-    coords = torch.tensor([[5.5, 7.5]], dtype=torch.float64)
-    first = torch.zeros((1, 1), dtype=torch.int64)
-    torch.testing.assert_close(
-        small.cameras.generate_rays(first, coords).directions, large.cameras.generate_rays(first, 2 * coords).directions
-    )
-    np.testing.assert_allclose(
-        small.images[0][5, 7], large.images[0][10:12, 14:16].mean(axis=(0, 1), dtype=np.float64), atol=0.51
-    )
-
-
 @pytest.mark.parametrize("suffix", ["", ".png"])
 def test_names_without_suffix(suffix: str, tmp_path: Path) -> None:
     document = write_transforms(tmp_path)
@@ -258,79 +191,6 @@ def test_names_without_suffix(suffix: str, tmp_path: Path) -> None:
     document["frames"][1]["file_path"] = "images/view 01"
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     assert len(read(tmp_path).names) == 7
-
-
-def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
-    data = iio.imwrite("<bytes>", image, extension=".jpg", quality=100)
-    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
-
-
-@pytest.mark.parametrize(("orientation", "stored"), [
-    (6, lambda image: np.rot90(image)), (8, lambda image: np.rot90(image, -1)),
-    (5, lambda image: image.swapaxes(0, 1)), (7, lambda image: np.rot90(image, 2).swapaxes(0, 1)),
-])  # fmt: skip
-def test_orientations_are_applied_where_the_size_says_so(orientation: int, stored: Any, tmp_path: Path) -> None:
-    write_colmap(tmp_path)
-    for i, name in enumerate(NAMES):
-        write_turned(tmp_path / "images" / name, stored(picture(i)), orientation)
-    difference = read(tmp_path).images[0].astype(int) - picture(1)
-    assert np.abs(difference).mean() < 4  # JPEG's
-
-
-def test_orientations_that_the_camera_ignored(tmp_path: Path) -> None:
-    write_colmap(tmp_path)
-    for i, name in enumerate(NAMES):
-        write_turned(tmp_path / "images" / name, picture(i), 6)
-    assert np.abs(read(tmp_path).images[0].astype(int) - picture(1)).mean() < 4
-
-
-def test_orientations_that_may_mean_either_are_refused(tmp_path: Path) -> None:
-    write_colmap(tmp_path)
-    write_turned(tmp_path / "images" / NAMES[3], picture(3), 3)
-    with pytest.raises(InputError, match=r"images\[3\]: .*EXIF orientation 3"):
-        read(tmp_path)
-
-
-def test_more_than_the_machine_has_is_refused_before_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_transforms(tmp_path)
-    monkeypatch.setattr(memory, "available_memory", lambda: 2 * 7 * (WIDTH // 3) * (HEIGHT // 3) * 3)
-    monkeypatch.setattr("edge_se_sampler.data.frames.read_image", None)  # would not be callable
-    with pytest.raises(InputError, match=r"transforms\.json: its 7 images take .*; give --downscale 3"):
-        read(tmp_path)
-
-
-def test_pixels_that_show_nothing_are_masked(tmp_path: Path) -> None:
-    """A principal point outside leaves no zoom at which all pixels show something."""
-    document = write_transforms(tmp_path, OPENCV) | {"cx": 70.0, "k1": 0.3}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
-    masks = read(tmp_path).masks
-    assert masks is not None
-    assert 0 < masks[0].mean() < 1
-
-
-def test_a_polynomial_that_turns_back_shows_no_pixel_twice(tmp_path: Path) -> None:
-    document = write_transforms(tmp_path, Distortion("OPENCV", {"k1": -1.2}))
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
-    frame = read_transforms(tmp_path).frames[0]
-    sources, inside = find_sources(frame.camera, frame.pinhole, WIDTH, HEIGHT)
-    row = round(CY)
-    shown = np.diff(sources[0, row][inside[row]])
-    assert (shown > 0).all()
-
-
-def test_transparent_colors_do_not_show_between_pixels(tmp_path: Path) -> None:
-    """Red in front of transparent green stays red where the lens's image falls between both."""
-    write_colmap(tmp_path, OPENCV)
-    image = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
-    image[...] = (0, 255, 0, 0)
-    image[8:25, 9:30] = (255, 0, 0, 255)
-    for name in NAMES:
-        iio.imwrite(tmp_path / "images" / name, image)
-    shown = read(tmp_path).images[0]
-    partly = (shown[..., 3] > 0) & (shown[..., 3] < 255)
-    assert partly.sum() > 20
-    assert (shown[shown[..., 3] > 0][:, :3] == (255, 0, 0)).all()
 
 
 def test_a_run_records_what_is_held_out_and_eval_uses_the_same(tmp_path: Path, edge_se: Any) -> None:
