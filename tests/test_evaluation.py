@@ -122,6 +122,17 @@ def test_rendering_in_chunks_changes_neither_values_nor_the_models_mode(
     assert model.training is training
 
 
+def test_masked_pixels_do_not_count_and_views_without_others_are_left_out() -> None:
+    """White renderings of views that are white where they are known."""
+    image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image[:, 3:] = 255
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[:, 3:] = True
+    pictures = to_pictures(views_of(image, image).with_masks([mask, mask & False]))
+    assert [picture.name for picture in pictures] == ["view 0"]
+    assert evaluate(empty_model(), pictures)["psnr"] == render_view(empty_model(), pictures[0])[1] == 100
+
+
 def test_the_callback_gets_every_view_in_order() -> None:
     views = tiny_views(3, 4, 5)
     seen: list[tuple[int, str, np.ndarray]] = []

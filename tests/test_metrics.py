@@ -120,6 +120,23 @@ def test_the_edge_band_leaves_weaker_edges_out() -> None:
     )
 
 
+def test_pixels_outside_a_mask_count_in_no_metric() -> None:
+    """Half of a picture is rendered well, the other half badly, and unknown."""
+    image = np.random.default_rng(0).random((HEIGHT, WIDTH, 4)).astype(np.float32)
+    image[:4, :, 3] = 0
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[:, : WIDTH // 2] = True
+    rendered = composite_on(image) + np.float32(0.1)
+    known = compute_metrics(rendered, image, 1.0, mask)
+    rendered[~mask] = 0
+    assert compute_metrics(rendered, image, 1.0, mask) == known
+    assert known["psnr"] == pytest.approx(20, abs=1e-3)
+    assert known["background_mse"] == pytest.approx(0.01, rel=1e-3)
+    assert known["foreground_psnr"] == pytest.approx(20, abs=1e-3)
+    nothing = compute_metrics(rendered, image, 1.0, np.zeros_like(mask))
+    assert set(nothing.values()) == {None}
+
+
 def test_metrics_without_pixels_are_none() -> None:
     no_alpha = compute_metrics(gray(0.4), gray(0.5), 1.0)
     assert no_alpha["foreground_psnr"] is no_alpha["background_mse"] is None

@@ -42,7 +42,7 @@ def measure_outcome(images: list[dict[str, Any]], pictures: list[Picture], color
     Returns its outcome, psnr, background_psnr, and foreground_share: the error on the object as a share of the
     background's there; means over views. InputError if no view tells the object from the background.
     """
-    background = [compute_metrics(np.full((*p.image.shape[:2], 3), color), p.image, color) for p in pictures]
+    background = [compute_metrics(np.full_like(p.image[..., :3], color), p.image, color, p.mask) for p in pictures]
     key = "foreground_psnr"
     views = zip(images, background, strict=True)
     gains = [rendered[key] - empty[key] for rendered, empty in views if None not in (rendered[key], empty[key])]

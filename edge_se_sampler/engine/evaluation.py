@@ -21,13 +21,14 @@ from edge_se_sampler.models.ray_model import RayModel
 def evaluate(
     model: RayModel, pictures: list[Picture], on_view: Callable[[int, Picture, np.ndarray], None] | None = None
 ) -> dict[str, Any]:
-    """Render every picture and compare all of its pixels, masked ones included; on_view gets index, picture and
-    rendering (H, W, 3). Returns the mean of every metric over the views, psnr_std, psnr_pooled (of the mean mse),
+    """Render every picture and compare all of its pixels that are known; on_view gets index, picture and rendering
+    (H, W, 3). Returns the mean of every metric over the views, psnr_std, psnr_pooled (of the mean mse),
     num_images, and `images`, the metrics of each. lpips is None: its weights are not part of this package."""
     rows = []
     for i, picture in enumerate(pictures):
         rendered, _ = render_view(model, picture)
-        rows.append({"name": picture.name, **compute_metrics(rendered, picture.image, model.config.background_level)})
+        metrics = compute_metrics(rendered, picture.image, model.config.background_level, picture.mask)
+        rows.append({"name": picture.name, **metrics})
         if on_view is not None:
             on_view(i, picture, rendered)
     columns = {key: [row[key] for row in rows if row[key] is not None] for key in rows[0]}

@@ -25,9 +25,9 @@ def psnr(mse: float) -> float:
     return 100.0 if mse <= 1e-10 else -10 * math.log10(mse)
 
 
-def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
-    """Mean over pixels and channels of the structural similarity (Wang et al. 2004) of two (H, W, 3) images, with
-    Gaussian windows within the image; None if an image's side is shorter than a window."""
+def ssim(first: np.ndarray, second: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+    """Mean over pixels, those of a mask (H, W) bool if there is one, and channels of the structural similarity (Wang et
+    al. 2004) of two (H, W, 3) images, with Gaussian windows within the image; None if there is no such window."""
     if min(first.shape[:2]) < SSIM_WINDOW:
         return None
     border = SSIM_WINDOW // 2
@@ -40,7 +40,10 @@ def ssim(first: np.ndarray, second: np.ndarray) -> float | None:
     variances = local_mean(x * x) - mean_x**2 + local_mean(y * y) - mean_y**2
     covariance = local_mean(x * y) - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
-    return float((luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean())
+    similarity = luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)
+    if mask is not None:
+        similarity = similarity[mask[border:-border, border:-border]]
+    return float(similarity.mean()) if similarity.size else None
 
 
 def edge_band(image: np.ndarray) -> np.ndarray:
@@ -51,22 +54,29 @@ def edge_band(image: np.ndarray) -> np.ndarray:
     return cv2.dilate(band.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
-def compute_metrics(rendered: np.ndarray, image: np.ndarray, background_color: float) -> dict[str, float | None]:
+def compute_metrics(
+    rendered: np.ndarray, image: np.ndarray, background_color: float, mask: np.ndarray | None = None
+) -> dict[str, float | None]:
     """All metrics of a rendering (H, W, 3) of an image; None where there is nothing to measure (no alpha, no object).
-    mse is over pixels and channels, foreground_psnr where alpha > 0, background_mse where alpha = 0."""
+    mse is over pixels and channels, foreground_psnr where alpha > 0, background_mse where alpha = 0; pixels outside a
+    mask (H, W) bool are unknown: they count in none of them."""
     target = composite_on(image, background_color)
+    known = np.ones(target.shape[:2], dtype=bool) if mask is None else mask
+    rendered = np.where(known[..., None], rendered, target)  # or SSIM's windows would look beyond the mask
     error = ((rendered.astype(np.float64) - target) ** 2).mean(axis=2)
     foreground = image[..., 3] > 0 if image.shape[2] == 4 else None
 
-    def psnr_of(pixels: np.ndarray | None) -> float | None:
-        return None if pixels is None or not pixels.any() else psnr(error[pixels].mean())
+    def mean_error(pixels: np.ndarray | None) -> float | None:
+        return None if pixels is None or not (pixels & known).any() else float(error[pixels & known].mean())
 
-    background = None if foreground is None or foreground.all() else error[~foreground]
+    def psnr_of(pixels: np.ndarray | None) -> float | None:
+        return None if (mse := mean_error(pixels)) is None else psnr(mse)
+
     return {
-        "mse": float(error.mean()),
-        "psnr": psnr(error.mean()),
-        "ssim": ssim(rendered, target),
+        "mse": mean_error(known),
+        "psnr": psnr_of(known),
+        "ssim": ssim(rendered, target, mask),
         "foreground_psnr": psnr_of(foreground),
         "edge_band_psnr": psnr_of(edge_band(target)),
-        "background_mse": None if background is None else float(background.mean()),
+        "background_mse": None if foreground is None else mean_error(~foreground),
     }

@@ -23,6 +23,8 @@ class Picture:
     image: np.ndarray
     """(H, W, 3|4) float32 in [0, 1], straight alpha."""
     camera: Cameras  # one
+    mask: np.ndarray | None = None
+    """(H, W) bool: the pixels that are known; None: all."""
 
     def rays(self, device: torch.device) -> RayBundle:
         """The H * W rays of its pixels, row by row."""
@@ -30,7 +32,13 @@ class Picture:
 
 
 def to_pictures(views: Views) -> list[Picture]:
-    return [Picture(name, unit_float(views.images[i]), views.cameras[[i]]) for i, name in enumerate(views.names)]
+    """All views but those of which no pixel is known."""
+    masks = [None] * len(views.names) if views.masks is None else views.masks
+    return [
+        Picture(name, unit_float(views.images[i]), views.cameras[[i]], masks[i])
+        for i, name in enumerate(views.names)
+        if masks[i] is None or masks[i].any()
+    ]
 
 
 @torch.no_grad()
@@ -52,10 +60,11 @@ def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torc
 
 
 def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
-    """A view's rendering (H, W, 3) in [0, 1] and its PSNR; FloatingPointError if a rendered value is not finite."""
+    """A view's rendering (H, W, 3) in [0, 1] and its PSNR over the pixels that are known; FloatingPointError if a
+    rendered value is not finite."""
     height, width = picture.image.shape[:2]
     rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
     if not np.isfinite(rendered).all():
         raise FloatingPointError("the model's colors are not finite: training diverged; try a lower --optimizer.lr")
     error = (rendered.astype(np.float64) - composite_on(picture.image, model.config.background_level)) ** 2
-    return rendered, psnr(error.mean())
+    return rendered, psnr(float(error.mean() if picture.mask is None else error[picture.mask].mean()))
