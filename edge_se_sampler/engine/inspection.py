@@ -26,17 +26,25 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     hull, hit_pixels = analysis.hull, analysis.hit_pixels
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
     ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
+    poses = views.cameras.camera_to_worlds.numpy()
+    sampled = poses[:, :, 3] - np.multiply.outer(config.depths, poses[:, :, 2])  # optical axes, from near to far
     for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
         right, up = (other for other in range(3) if other != along)
         extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
+        depths = axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6, zorder=-2)
+        cameras = axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3, zorder=-1)
         axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
         axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
+        axis.autoscale()
+    figure.legend([cameras[0], depths[0]], ["cameras", "depths at which rays are sampled"], ncols=2, loc="upper center")
     chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
-    for axis, k in zip(axes[1], chosen, strict=True):  # dark where rays miss the hull
+    axes[1, 1].set_xlabel("dark: pixels whose rays miss these cells")
+    for axis, k in zip(axes[1], chosen, strict=True):
         color = composite_on(unit_float(views.images[k]))
         axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
-        axis.set(xticks=[], yticks=[], title=f"{views.names[k]}: pixels that may show the object")
-    figure.tight_layout()
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(views.names[k], fontsize=9)
+    figure.tight_layout(rect=(0, 0, 1, 0.96))
     save_figure(figure, path)
     return "\n".join(
         f"{name:<13}{finding}" for name, finding in _findings(views, analysis, config, depth_source).items()
