@@ -8,9 +8,10 @@ u, v   pixels right and down; f, c: focal length and principal point, pixels
 
 A point of the cell lies at (x + e_x, z + e_z) with |e_x| <= a_x, |e_z| <= a_z, so its pixel is within
 f (a_x z + |x| a_z) / (z (z - a_z)) = (f a_x + |u - c| a_z) / (z - a_z) of the center's. A cell is carved away only if
-that whole rectangle and a margin are background in several views: a mask that is a little too small, or shifted, or
-empty in one view, carves nothing away. What lies outside an image counts as background if the silhouette keeps clear of
-the border, for then the image shows the whole object. Carving begins with large cells and subdivides those it keeps.
+that whole rectangle and a margin are background in several views, or in all that see it: a mask that is a little too
+small, or shifted, or empty in one view, carves nothing away that others see. What lies outside an image counts as
+background if the silhouette keeps clear of the border, for then the image shows the whole object. Carving begins with
+large cells and subdivides those it keeps.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from edge_se_sampler.data.views import Views
 MARGIN = 2
 """Pixels by which a silhouette may be too small, or moved."""
 MIN_EMPTY_VIEWS = 2
-"""Views that must show a cell to be empty, if there are as many."""
+"""Views that must show a cell to be empty, if as many see it."""
 INITIAL_RESOLUTION = 16
 """Cells along the box when carving begins."""
 MIN_CANDIDATES = 0.8
@@ -117,25 +118,36 @@ def find_silhouettes(views: Views) -> dict[int, Silhouette]:
     return found
 
 
-def carve(views: Views, silhouettes: dict[int, Silhouette], box: Box, cell_size: float) -> Hull | None:
-    """The cells, of that size, of a box that may hold something, None if there are none; without silhouettes (by the
-    view's index), all that views see."""
+def carve(
+    views: Views, silhouettes: dict[int, Silhouette], box: Box, cell_size: float, max_cells: float = np.inf
+) -> Hull | None:
+    """The cells of a box that may hold something, None if there are none; without silhouettes (by the view's index),
+    all that views see. They are of that size, or 2, 4, ... times as large where they would be more than max_cells."""
     levels = max(0, int(np.ceil(np.log2(2 * box.half_extent / (INITIAL_RESOLUTION * cell_size)))))
-    aabb_min = box.center - cell_size * INITIAL_RESOLUTION * 2**levels / 2
-    kept = _grid_indices(INITIAL_RESOLUTION)
-    for level in range(levels + 1):
-        if level:
-            kept = (2 * kept[:, None] + _grid_indices(2)).reshape(-1, 3)
-        size = cell_size * 2 ** (levels - level)
-        centers = aabb_min + (kept + 0.5) * size
-        in_box = (np.abs(centers - box.center) < box.half_extent + size / 2).all(axis=1)
-        kept = kept[in_box][_may_hold_something(views, silhouettes, centers[in_box], size)]
+    size = cell_size * 2**levels
+    aabb_min = box.center - size * INITIAL_RESOLUTION / 2
+    kept = _select_cells(views, silhouettes, box, aabb_min, size, _grid_indices(INITIAL_RESOLUTION))
+    for _ in range(levels):
+        children = (2 * kept[:, None] + _grid_indices(2)).reshape(-1, 3)
+        children = _select_cells(views, silhouettes, box, aabb_min, size / 2, children)
+        if len(children) > max_cells:
+            break
+        kept, size = children, size / 2
     if not len(kept):
         return None
     low, high = kept.min(axis=0), kept.max(axis=0)
     cells = np.zeros(high - low + 1, dtype=bool)
     cells[tuple((kept - low).T)] = True
-    return Hull(aabb_min + low * cell_size, cell_size, cells)
+    return Hull(aabb_min + low * size, size, cells)
+
+
+def _select_cells(
+    views: Views, silhouettes: dict[int, Silhouette], box: Box, aabb_min: np.ndarray, size: float, indices: np.ndarray
+) -> np.ndarray:
+    """Those of the cells (m, 3), by their index from a corner, that are in the box and may hold something."""
+    centers = aabb_min + (indices + 0.5) * size
+    in_box = (np.abs(centers - box.center) < box.half_extent + size / 2).all(axis=1)
+    return indices[in_box][_may_hold_something(views, silhouettes, centers[in_box], size)]
 
 
 def _grid_indices(size: int) -> np.ndarray:
@@ -146,24 +158,36 @@ def _grid_indices(size: int) -> np.ndarray:
 def _may_hold_something(
     views: Views, silhouettes: dict[int, Silhouette], centers: np.ndarray, cell_size: float
 ) -> np.ndarray:
-    """(m,) bool: cells that some view sees and that fewer than MIN_EMPTY_VIEWS show to be empty."""
-    min_empty_views = min(MIN_EMPTY_VIEWS, max(1, len(silhouettes)))
+    """(m,) bool: cells in which some view may see something, and that fewer than MIN_EMPTY_VIEWS show to be empty."""
+    if not silhouettes:
+        return _is_seen(views, centers, cell_size)
     candidates = np.arange(len(centers))  # all that are not known to be empty, and maybe some that are
-    empty_views, seen = np.zeros(len(centers), dtype=np.int32), np.zeros(len(centers), dtype=bool)
+    empty_views, supported = np.zeros(len(centers), dtype=np.int32), np.zeros(len(centers), dtype=bool)
     for i, image in enumerate(views.images):
         low, high, side = project_cells(views.cameras, i, centers[candidates], cell_size)
         height, width = image.shape[:2]
-        seen |= _in_image(low, high, width, height) & (side == IN_FRONT) | (side == STRADDLING)
+        empty = np.zeros(len(candidates), dtype=bool)
         if i in silhouettes:
             all_in_image = (low[0] >= 0) & (low[1] >= 0) & (high[0] <= width) & (high[1] <= height)
             known = (side == IN_FRONT) & (all_in_image | silhouettes[i].uncropped)
-            empty_views += known & ~silhouettes[i].overlaps(low, high)
-            undecided = empty_views < min_empty_views
-            if np.count_nonzero(undecided) < MIN_CANDIDATES * len(undecided):
-                candidates, seen, empty_views = candidates[undecided], seen[undecided], empty_views[undecided]
+            empty = known & ~silhouettes[i].overlaps(low, high)
+        empty_views += empty
+        supported |= _in_view(low, high, side, width, height) & ~empty
+        undecided = empty_views < MIN_EMPTY_VIEWS
+        if np.count_nonzero(undecided) < MIN_CANDIDATES * len(undecided):
+            candidates, supported, empty_views = candidates[undecided], supported[undecided], empty_views[undecided]
     result = np.zeros(len(centers), dtype=bool)
-    result[candidates] = seen & (empty_views < min_empty_views)
+    result[candidates] = supported & (empty_views < MIN_EMPTY_VIEWS)
     return result
+
+
+def _is_seen(views: Views, centers: np.ndarray, cell_size: float) -> np.ndarray:
+    """(m,) bool: cells that some view sees a part of."""
+    unseen = np.arange(len(centers))
+    for i, image in enumerate(views.images):
+        low, high, side = project_cells(views.cameras, i, centers[unseen], cell_size)
+        unseen = unseen[~_in_view(low, high, side, *image.shape[1::-1])]
+    return ~np.isin(np.arange(len(centers)), unseen, assume_unique=True)
 
 
 def project_cells(
@@ -191,6 +215,11 @@ def project_cells(
 def _in_image(low: np.ndarray, high: np.ndarray, width: int, height: int) -> np.ndarray:
     """(m,) bool: whether rectangles (2, m) have any part in the image."""
     return (high[0] > 0) & (high[1] > 0) & (low[0] < width) & (low[1] < height)
+
+
+def _in_view(low: np.ndarray, high: np.ndarray, side: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(m,) bool: whether cells, by what `project_cells` returns, may have any part in the image."""
+    return (side == STRADDLING) | (side == IN_FRONT) & _in_image(low, high, width, height)
 
 
 def find_hit_pixels(views: Views, hull: Hull) -> list[np.ndarray]:

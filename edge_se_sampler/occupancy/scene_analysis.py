@@ -3,6 +3,7 @@ to be subdivided."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -79,15 +80,8 @@ def _carve_initial(
     views: Views, silhouettes: dict[int, Silhouette], box: Box, finest: float
 ) -> tuple[Hull | None, int]:
     """The hull in the cells with which training begins, and how often they are to be subdivided."""
-    level = MIN_LEVELS
-    while True:
-        size = finest * 2**level
-        # a box of more cells takes long to carve
-        within = (2 * box.half_extent / size) ** 3 <= 64 * MAX_INITIAL_CELLS
-        hull = carve(views, silhouettes, box, size) if within else None
-        if within and (hull is None or hull.cells.sum() <= MAX_INITIAL_CELLS):
-            return hull, level
-        level += 1
+    hull = carve(views, silhouettes, box, finest * 2**MIN_LEVELS, MAX_INITIAL_CELLS)
+    return hull, MIN_LEVELS if hull is None else round(math.log2(hull.cell_size / finest))
 
 
 def _missed_fraction(views: Views, silhouettes: Mapping[int, Silhouette], hit_pixels: list[np.ndarray]) -> float:
