@@ -123,10 +123,19 @@ def test_orientations_that_may_mean_either_are_refused(tmp_path: Path) -> None:
 
 def test_more_than_the_machine_has_is_refused_before_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_transforms(tmp_path)
-    monkeypatch.setattr(memory, "available_memory", lambda: 2 * 7 * (WIDTH // 3) * (HEIGHT // 3) * 3)
+    monkeypatch.setattr(memory, "available_memory", lambda: 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + 20))
     monkeypatch.setattr("edge_se_sampler.data.frames.read_image", None)  # would not be callable
     with pytest.raises(InputError, match=r"transforms\.json: its 7 images take .*; give --downscale 3"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize(("limit", "expected"), [("1000", 700), ("400", 100), ("max", None)])
+def test_a_containers_memory_counts(limit: str, expected: int | None, tmp_path: Path) -> None:
+    (tmp_path / "memory.max").write_text(f"{limit}\n")
+    (tmp_path / "memory.current").write_text("500\n")
+    (tmp_path / "memory.stat").write_text("anon 300\ninactive_file 200\n")
+    assert memory._available_in_container(tmp_path) == expected
+    assert memory._available_in_container(tmp_path / "none") is None
 
 
 def test_pixels_that_show_nothing_are_masked(tmp_path: Path) -> None:

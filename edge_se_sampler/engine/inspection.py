@@ -31,12 +31,13 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
         right, up = (other for other in range(3) if other != along)
         extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
-        depths = axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6, zorder=-2)
-        cameras = axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3, zorder=-1)
+        axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6, zorder=-2)
+        axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3, zorder=-1)
         axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
         axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
         axis.autoscale()
-    figure.legend([cameras[0], depths[0]], ["cameras", "depths at which rays are sampled"], ncols=2, loc="upper center")
+    lines = axes[0, 0].lines
+    figure.legend([lines[-1], lines[0]], ["cameras", "depths at which rays are sampled"], ncols=2, loc="upper center")
     chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
     axes[1, 1].set_xlabel("dark: pixels whose rays miss these cells")
     for axis, k in zip(axes[1], chosen, strict=True):

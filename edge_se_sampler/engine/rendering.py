@@ -33,11 +33,11 @@ class Picture:
 
 def to_pictures(views: Views) -> list[Picture]:
     """All views but those of which no pixel is known."""
-    masks = [None] * len(views.names) if views.masks is None else views.masks
+    masks = (None,) * len(views.names) if views.masks is None else views.masks
     return [
-        Picture(name, unit_float(views.images[i]), views.cameras[[i]], masks[i])
-        for i, name in enumerate(views.names)
-        if masks[i] is None or masks[i].any()
+        Picture(name, unit_float(views.images[i]), views.cameras[[i]], mask)
+        for i, (name, mask) in enumerate(zip(views.names, masks, strict=True))
+        if mask is None or mask.any()
     ]
 
 
