@@ -34,7 +34,7 @@ def read_colmap(folder: Path) -> Capture:
     model = find_model(folder)
     assert model is not None
     cameras, listed = read_cameras(model), read_images(model)
-    images_folder = _find_images(folder)
+    images_folder = find_images(folder)
     listed.sort(key=lambda image: image.name)
     files = [_locate(images_folder, image) for image in listed]
     check_listed_once(files)
@@ -51,7 +51,8 @@ def read_colmap(folder: Path) -> Capture:
     return Capture(frames, missing, points=_points_of(model, [image for image, _ in pairs]))
 
 
-def _find_images(folder: Path) -> Path:
+def find_images(folder: Path) -> Path:
+    """The first of FOLDERS that there is; InputError if there is none."""
     for name in FOLDERS:
         if (folder / name).is_dir():
             return folder / name

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 from edge_se_sampler.protocol import InstantiateConfig, PixelSamplerConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
-DataFormat = Literal["auto", "blender", "transforms", "colmap"]
+DataFormat = Literal["auto", "blender", "transforms", "colmap", "llff"]
 Masks = Literal["ignore", "object"]
 
 

@@ -12,17 +12,19 @@ from edge_se_sampler.data.colmap import read_colmap
 from edge_se_sampler.data.colmap_model import find_model
 from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.data.frames import LoadSettings, Progress, load_views
+from edge_se_sampler.data.llff import bounds_path, read_llff
 from edge_se_sampler.data.scene_file import SourceLocation, check_folder
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError, check_value
 
-READERS = {"transforms": read_transforms, "colmap": read_colmap}
+READERS = {"transforms": read_transforms, "colmap": read_colmap, "llff": read_llff}
 """Of the formats whose images we may have to split."""
 CONTENTS = {
     "blender": "transforms_train.json",
     "transforms": "transforms.json",
     "colmap": "sparse/0, sparse or colmap/sparse/0 with cameras, images and points3D",
+    "llff": "poses_bounds.npy",
 }
 """Files by which each format is recognized."""
 
@@ -48,6 +50,8 @@ def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
         found.append("transforms")
     if find_model(folder) is not None:
         found.append("colmap")
+    if bounds_path(folder).exists():
+        found.append("llff")
     if data_format in found or (data_format == "auto" and found):
         return found[0] if data_format == "auto" else data_format
     wanted = CONTENTS if data_format == "auto" else {data_format: CONTENTS[data_format]}
