@@ -16,7 +16,7 @@ from edge_se_sampler.engine.pipeline import load_weights, saved_grid
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models import lean
+from edge_se_sampler.models import lean, voxel_backend
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import LeanModel
 from edge_se_sampler.models.ray_model import ParameterGroup
@@ -332,10 +332,10 @@ def test_outputs_in_evaluation_do_not_depend_on_chunks() -> None:
 def test_without_numba_one_line_says_what_it_would_bring(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(lean, "find_spec", lambda name: None)
-    lean.compiled_ops.cache_clear()
+    monkeypatch.setattr(voxel_backend, "find_spec", lambda name: None)
+    voxel_backend.compiled_ops.cache_clear()
     try:
         assert steps_of(tiny_trainer(config_of(5), VIEWS), 5)
         assert capsys.readouterr().err.count("edge-se-sampler[fast]") == 1
     finally:
-        lean.compiled_ops.cache_clear()
+        voxel_backend.compiled_ops.cache_clear()

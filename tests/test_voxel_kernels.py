@@ -17,7 +17,7 @@ from tiny import ball_views, tiny_trainer
 
 from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models import lean, voxel_kernels, voxel_ops
+from edge_se_sampler.models import voxel_backend, voxel_kernels, voxel_ops
 from edge_se_sampler.models.lean import ColorNetwork
 from edge_se_sampler.models.voxel_kernels import rendering
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
@@ -285,7 +285,7 @@ def test_kernels_that_have_just_been_compiled_round_as_those_that_are_loaded(tmp
 
 
 def losses(ops: ModuleType, monkeypatch: pytest.MonkeyPatch, steps: int = 50) -> list[float]:
-    monkeypatch.setattr(lean, "compiled_ops", lambda: None if ops is voxel_ops else ops)
+    monkeypatch.setattr(voxel_backend, "compiled_ops", lambda: None if ops is voxel_ops else ops)
     config: TrainerConfig = method_configs()["lean-nerf"]
     changes = {f"{MANAGER}.train_num_rays_per_batch": 64, f"{MODEL}.voxel_size_px": 0.5}
     # a sample at a threshold falls on one side or the other by rounding, and has to matter little

@@ -10,8 +10,8 @@ import torch
 
 from edge_se_sampler.engine.config import OptimizerConfig
 from edge_se_sampler.models.config import SizePreset
-from edge_se_sampler.models.lean import choose_ops
 from edge_se_sampler.models.ray_model import ParameterGroup
+from edge_se_sampler.models.voxel_backend import choose_ops
 
 TOTAL_VARIATION_INTERVAL = 4
 """Steps between two that total variation counts in, by as much more: looking at all neighbors takes time."""

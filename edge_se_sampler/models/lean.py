@@ -14,18 +14,15 @@ from __future__ import annotations
 import math
 import sys
 import time
-from functools import cache
-from importlib.util import find_spec
-from types import ModuleType
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
-from edge_se_sampler.models import voxel_ops
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
+from edge_se_sampler.models.voxel_backend import choose_ops, compiled_ops
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -55,31 +52,6 @@ MAX_RATIO = 0.8
 """Cells that would be larger than this part of the present ones are not worth subdividing."""
 BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
 """Density, features, the running means of their gradients and those of squares, and what the grid keeps of a row."""
-
-
-def choose_ops(weight: Tensor) -> ModuleType:
-    """What renders a model with such weights: `voxel_kernels`, with as many threads as torch has, for float32 on a CPU
-    where numba is installed; else plain torch."""
-    ops = compiled_ops() if weight.device.type == "cpu" and weight.dtype == torch.float32 else None
-    if ops is None:
-        return voxel_ops
-    ops.set_num_threads(torch.get_num_threads())
-    return ops
-
-
-@cache
-def compiled_ops() -> ModuleType | None:
-    """`voxel_kernels`; None without numba."""
-    if find_spec("numba") is None:
-        hint = 'pip install "edge-se-sampler[fast]" makes this model much faster on a CPU'
-        print(f"edge-se: numba is not installed; {hint}", file=sys.stderr)
-        return None
-    num_threads = torch.get_num_threads()
-    from edge_se_sampler.models import voxel_kernels
-
-    voxel_kernels.set_num_threads(num_threads)
-    torch.set_num_threads(num_threads)  # as numba begins it sets OpenMP's number, which is torch's too
-    return voxel_kernels
 
 
 def compile_ops(device: str) -> None:
