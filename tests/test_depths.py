@@ -69,7 +69,7 @@ def test_points_decide_but_for_stray_ones() -> None:
 
 def test_cameras_alone() -> None:
     found = find_depths(opaque(moved(ball_views(12, 32), 10.0, (1.0, 2.0, 3.0))))
-    assert (found.near, found.far) == pytest.approx((4, 80), rel=1e-3)
+    assert (found.near, found.far) == pytest.approx((12, 80), rel=1e-3)
     assert "cameras" in found.source
 
 

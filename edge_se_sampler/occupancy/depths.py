@@ -26,9 +26,9 @@ HULL_RESOLUTION = 64
 MIN_SEEN = 0.9
 """Share of the views that see a cell of the object, of the most that see any: the others are too few to carve what only
 they see."""
-CAMERA_FACTORS = 0.1, 2.0
-"""Near and far of cameras alone, as multiples of their median distance from the focus: from closely before them to as
-far behind the focus as they are before it."""
+CAMERA_FACTORS = 0.3, 2.0
+"""Near and far of cameras alone, as multiples of their median distance from the focus: as far behind it as they are
+before it; and nothing that only one or two of them see, for there a model can make up something for each image."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _depths_of_cameras(views: Views) -> DepthRange | None:
     if len(views.cameras) < 2 or not distance > 0:
         return None
     near, far = (factor * distance for factor in CAMERA_FACTORS)
-    return DepthRange(*_rounded(near, far), "the cameras: 0.1 to 2 times as far as what they look at")
+    return DepthRange(*_rounded(near, far), "the cameras: 0.3 to 2 times as far as what they look at")
 
 
 def _depth(cameras: Cameras, camera: int, points: np.ndarray) -> np.ndarray:
