@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench.baselines import run as run_module
 from edge_se_sampler.bench.baselines.run import BaselineSettings, Clock, TimeIsUp, mean_psnr, read_baselines, train
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.data.synthetic.folder import make_scenes
@@ -82,8 +81,7 @@ def checkout(folder: Path, name: str, text: str) -> Path:
 def test_the_clock_stands_still_during_an_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(ChartSettings, "clock", lambda _: now[0])
-    monkeypatch.setattr(run_module, "BASELINE_EVAL_SECONDS", (2, 7, 20))
-    clock = Clock(ChartSettings(seconds=10))
+    clock = Clock(ChartSettings(seconds=10), (7, 2, 20))
 
     def evaluate() -> float:
         now[0] += 50
@@ -109,7 +107,7 @@ def test_every_seed_is_trained_and_kept(data: Path, tmp_path: Path, edge_se: Any
         answer = edge_se("bench", "baselines", *options, "--flags=--netdepth 4", "--seeds", *seeds)
         assert answer.code == 0, answer
     path = tmp_path / "baselines" / "nerf-pytorch-4-x-64.json"
-    ((name, result),) = read_baselines(tmp_path, ChartSettings(1, threads=2, image_size=24)).items()
+    ((name, result),) = read_baselines(tmp_path, threads=2, image_size=24).items()
     commit = subprocess.run(["git", "-C", program, "rev-parse", "HEAD"], capture_output=True, text=True).stdout
     assert name == f"nerf-pytorch, 4 x 64 ({result['settings']['program_version']})"
     assert result["settings"]["flags"] == "--netdepth 4"
@@ -131,6 +129,20 @@ def test_every_seed_is_trained_and_kept(data: Path, tmp_path: Path, edge_se: Any
         assert path.read_bytes() == before
 
 
+def test_a_program_reads_a_smaller_copy(data: Path, tmp_path: Path, edge_se: Any) -> None:
+    text = NERF_PYTORCH.replace("(1, 24, 24, 3)", "(1, 12, 12, 3)")
+    program = checkout(tmp_path / "program", "run_nerf.py", text)
+    options = ["--program", "nerf-pytorch", "--checkout", program, "--output-dir", tmp_path, "--scenes", "mic",
+               "--seeds", 0, "--seconds", 1, "--threads", 2, "--workplace", tmp_path, "--downscale", 2]  # fmt: skip
+    answer = edge_se("bench", "baselines", *options, "--data", data.parent, "--eval-seconds", 0.4)
+    assert answer.code == 0, answer
+    ((_, result),) = read_baselines(tmp_path, image_size=12).items()
+    assert [seconds for seconds, _ in result["runs"][0]["curve"]] == [pytest.approx(s, abs=0.3) for s in (0.4, 1)]
+    answer = edge_se("bench", "baselines", *options)
+    assert answer.code == 2
+    assert "--downscale is 2: must be 1 without --data" in answer.err
+
+
 def test_a_program_that_refuses_its_flags_or_ends_early_is_named_in_one_line(
     data: Path, tmp_path: Path, edge_se: Any
 ) -> None:
@@ -148,10 +160,7 @@ def test_a_program_that_refuses_its_flags_or_ends_early_is_named_in_one_line(
     assert not list(tmp_path.glob("baselines/*"))
 
 
-def test_a_program_whose_evaluation_needs_a_gpu_is_evaluated_without(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run_module, "BASELINE_EVAL_SECONDS", ())
+def test_a_program_whose_evaluation_needs_a_gpu_is_evaluated_without(data: Path, tmp_path: Path) -> None:
     settings = BaselineSettings(seconds=0.2, threads=2, program="tensorf", program_version="1", flags="")
     run = train(settings, checkout(tmp_path / "program", "train.py", TENSORF), data, seed=0)
     ((_, psnr),) = run["curve"]
@@ -178,15 +187,15 @@ RESULT = {
 def test_a_file_of_another_format_is_refused(content: Any, tmp_path: Path) -> None:
     write_baseline(tmp_path, content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(InputError, match=r"other.json: not a result of edge-se bench"):
-        read_baselines(tmp_path, ChartSettings())
+        read_baselines(tmp_path)
 
 
 @pytest.mark.parametrize(("field", "value"), [("threads", 2), ("image_size", 400)])
 def test_times_of_other_threads_or_image_sizes_are_refused(field: str, value: int, tmp_path: Path) -> None:
     write_baseline(tmp_path, json.dumps({**RESULT, "settings": {**SETTINGS, field: value}}))
-    assert list(read_baselines(tmp_path, ChartSettings(**{field: value}))) == ["other (1)"]
-    with pytest.raises(InputError, match=rf"other.json: {field} is {value}, the chart's is 1"):
-        read_baselines(tmp_path, ChartSettings())
+    assert list(read_baselines(tmp_path, **{field: value})) == ["other (1)"]
+    with pytest.raises(InputError, match=rf"other.json: {field} is {value}, of the result beside it 100"):
+        read_baselines(tmp_path, **{field: 100})
 
 
 def write_baseline(folder: Path, text: str) -> None:

@@ -7,17 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from capture_folder import HEIGHT, WIDTH, write_colmap
 
+from edge_se_sampler.bench.baselines.run import read_baselines
 from edge_se_sampler.bench.real.command import BenchReal
-from edge_se_sampler.bench.real.report import describe
+from edge_se_sampler.bench.real.figures import draw_chart
+from edge_se_sampler.bench.real.published import PUBLISHED
+from edge_se_sampler.bench.real.report import describe, draw
 from edge_se_sampler.bench.real.trials import VARIANTS, Settings, Trial, run_trial
 from edge_se_sampler.bench.runner import new_result, write_result
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.errors import InputError
 
 RUN = {
-    "psnr": 30.0, "ssim": 0.95, "val_psnr": 31.0, "train_psnr": 33.0, "steps": 1000, "seconds": 60.1,
-    "cpu_seconds": 110.0, "level": 2, "rows": 5_000_000, "memory": 1.9, "seconds_per_view": 0.1,
+    "size": [400, 400], "psnr": 30.0, "ssim": 0.95, "val_psnr": 31.0, "train_psnr": 33.0, "steps": 1000,
+    "seconds": 60.1, "cpu_seconds": 110.0, "level": 2, "rows": 5_000_000, "memory": 1.9, "seconds_per_view": 0.1,
 }  # fmt: skip
 
 
@@ -32,21 +36,45 @@ def test_a_training_is_measured_on_every_split(scenes: Path, tmp_path: Path) -> 
     run = run_trial(Trial("bricks", 1, "2s", "lean-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
     assert run.keys() == RUN.keys()
     assert run["seconds"] == pytest.approx(2, abs=1)
+    assert run["size"] == [24, 24]
     assert 12 < run["psnr"] < 40
     assert len({run[name] for name in ("psnr", "val_psnr", "train_psnr")}) == 3  # other views each
     assert 0.2 < run["memory"] < 4
 
 
-def result_of(folder: Path, runs: list[dict[str, Any]]) -> Path:
+def test_a_capture_has_no_validation_views_of_its_own(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "scenes" / "mug")
+    run = run_trial(Trial("mug", 2, "2s", "lean-nerf", 0), tmp_path / "scenes", tmp_path, Settings(num_train_views=1))
+    assert run["size"] == [WIDTH // 2, HEIGHT // 2]
+    assert run["val_psnr"] is None
+    assert 5 < run["psnr"] != run["train_psnr"]
+
+
+def result_of(folder: Path, runs: list[dict[str, Any]], *baselines: dict[str, Any]) -> Path:
     result = new_result("real", {"num_train_views": 5}) | {"errors": [], "runs": runs}
+    result["machine"]["threads"] = 2
     write_result(folder / "result.json", json.loads(json.dumps(result)))
+    for i, baseline in enumerate(baselines):
+        (folder / "baselines").mkdir(exist_ok=True)
+        write_result(folder / "baselines" / f"{i}.json", baseline)
     return folder
 
 
 def run_of(
-    psnr: float, seed: int, scene: str = "lego", budget: str = "1m", variant: str = "lean-nerf"
+    psnr: float, seed: int, scene: str = "lego", budget: str = "1m", variant: str = "lean-nerf", **more: Any
 ) -> dict[str, Any]:
-    return {"scene": scene, "downscale": 2, "budget": budget, "variant": variant, "seed": seed, **RUN, "psnr": psnr}
+    key = {"scene": scene, "downscale": 2, "budget": budget, "variant": variant, "seed": seed}
+    return {**key, **RUN, "psnr": psnr, **more}
+
+
+def baseline_of(
+    curves: dict[str, list[list[float]]], label: str = "", program: str = "other", image_size: int = 400
+) -> dict[str, Any]:
+    """A result of another program: scene -> curve of a seed."""
+    settings = {"seconds": 600, "threads": 2, "image_size": image_size, "program": program, "label": label,
+                "program_version": "1", "flags": ""}  # fmt: skip
+    runs = [{"scene": scene, "seed": 0, "steps": 9, "curve": curve} for scene, curve in curves.items()]
+    return new_result("baselines", settings) | {"errors": [], "runs": runs}
 
 
 def test_the_page_has_medians_and_differences_on_the_same_seeds(tmp_path: Path) -> None:
@@ -56,6 +84,69 @@ def test_the_page_has_medians_and_differences_on_the_same_seeds(tmp_path: Path) 
     assert "| lego, 400 px | 31.50 (30.00 to 32.00) | 33.00 |" in page
     assert "| chair, 400 px | 35.00 | – |" in page
     assert "| lego, 400 px | 1m | no hull | 29.50 | -0.50 | 1 |" in page
+
+
+def test_sizes_are_the_images(tmp_path: Path) -> None:
+    old = {key: value for key, value in run_of(31.0, 0, downscale=1).items() if key != "size"}  # NeRF's 800 pixels
+    fox = run_of(22.0, 0, scene="fox", downscale=4, size=[270, 480], val_psnr=None)
+    page = describe(result_of(tmp_path, [fox, old, run_of(30.0, 0)]))
+    table = page.split("\n\n")[3]
+    assert [line.split(" | ")[0] for line in table.splitlines()[2:]] == [
+        "| lego, 400 px",
+        "| lego, 800 px",
+        "| fox, 270 x 480 px",
+    ]
+    assert "| fox, 270 x 480 px | 1m | 22.00 | 0.95 | – | 33.00 |" in page
+
+
+LEGO = {"lego": [[60.4, 20.0], [180.2, 24.0], [600.3, 26.0]]}
+
+
+def test_other_programs_stand_beside_ours_at_equal_seconds(tmp_path: Path) -> None:
+    """The best of a program's trainings counts that were looked at then, on images of that size."""
+    runs = [run_of(psnr, 0, budget=budget) for psnr, budget in ((30.0, "1m"), (32.0, "3m"), (33.0, "10m"))]
+    runs += [run_of(31.0, 0, budget="3m", variant="no hull"), run_of(29.0, 0, "chair")]
+    runs += [run_of(21.0, 0, "fox", "5m", size=[270, 480], val_psnr=None)]
+    short = baseline_of({"lego": [[60.1, 19.0], [180.3, 25.0]]}, "180 s")
+    fox = baseline_of({"fox": [[60.0, 15.0], [300.0, 18.0], [600.0, 19.0]]}, "captures", image_size=480)
+    large = baseline_of({"lego": [[600.0, 99.0]]}, "large", image_size=800)
+    page = describe(result_of(tmp_path, runs, baseline_of(LEGO, "600 s"), short, fox, large))
+    assert "|  | program | 1m | 3m | 5m | 10m |" in page
+    assert "| lego, 400 px | lean-nerf | 30.00 | 32.00 | – | 33.00 |" in page
+    assert "| lego, 400 px | lean-nerf, no hull | – | 31.00 | – | – |" in page
+    assert "| lego, 400 px | other (1) | 20.00 | 25.00 | – | 26.00 |" in page
+    assert "| fox, 270 x 480 px | other (1) | – | – | 18.00 | – |" in page
+    assert "chair, 400 px | lean-nerf |" not in page  # nobody else was there
+
+
+def test_programs_on_other_threads_are_refused(tmp_path: Path) -> None:
+    other = baseline_of(LEGO)
+    other["settings"]["threads"] = 1
+    with pytest.raises(InputError, match="threads is 1"):
+        describe(result_of(tmp_path, [run_of(30.0, 0)], other))
+
+
+def test_the_chart_has_a_panel_for_every_scene_and_size(tmp_path: Path) -> None:
+    runs = [run_of(psnr, seed, budget=budget) for seed, budget, psnr in
+            ((0, "3m", 32.0), (0, "1m", 30.0), (1, "1m", 31.0), (2, "1m", 33.0))]  # fmt: skip
+    runs += [run_of(28.0, 0, variant="no hull"), run_of(20.0, 0, variant="uniform pixels")]
+    runs += [run_of(29.0, 0, downscale=1, size=[800, 800])]
+    folder = result_of(tmp_path, runs, baseline_of(LEGO))
+    figure = draw_chart(runs, read_baselines(folder))
+    small, large = figure.axes
+    assert (small.get_title(), large.get_title()) == ("lego, 400 px", "lego, 800 px")
+    lines = {line.get_label(): line for line in small.lines}
+    assert [*lines] == ["lean-nerf", "lean-nerf, no hull", "other (1)"]
+    assert lines["lean-nerf"].get_xydata().tolist() == [[60, 31], [180, 32]]
+    assert [line.get_linestyle() for line in lines.values()] == ["-", "--", ":"]
+    assert lines["other (1)"].get_xydata().tolist() == LEGO["lego"]
+    band = small.collections[0].get_paths()[0].vertices
+    assert {tuple(vertex) for vertex in band} >= {(60, 30), (60, 33), (180, 32)}
+    published = {line.get_label(): line.get_xydata().tolist() for line in large.lines[1:]}
+    assert len(published) == len(PUBLISHED)
+    assert [[900.0, 34.64]] in published.values()
+    draw(folder, None)
+    assert (folder / "chart.png").stat().st_size > 10_000
 
 
 def test_without_variants_there_is_no_section_of_them(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
-"""Other programs, run unchanged on the chart's scenes by the chart's clock.
+"""Other programs, run unchanged on the scenes of the chart or of bench real, by the same clock.
 
 A program is imported from a checkout of its own, or from this environment. Its training loop calls the clock after
 every step (in the place of its evaluation, which it then calls each time, or as a callback). The clock starts when
 the program begins to read the data, as it does for our trainings. Results are shown beside ours: DIR/baselines/*.json
-of a chart's folder DIR; a run has scene, seed and curve, rows of training seconds and mean PSNR of the test views.
+of their folder DIR; a run has scene, seed and curve, rows of training seconds and mean PSNR of the test views.
 """
 # pyright: reportMissingImports=false
 # no environment that is linted has the programs
@@ -19,7 +19,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -29,15 +29,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
+from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.dataset import read_split
 from edge_se_sampler.engine.metrics import compute_metrics
-from edge_se_sampler.engine.rendering import to_pictures
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.errors import InputError
-
-BASELINE_EVAL_SECONDS = EVAL_SECONDS[1::3]
-"""Fewer than ours: some programs take minutes to render the test views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +51,9 @@ class BaselineSettings(ChartSettings):
         return f"{self.program}, {self.label}" if self.label else self.program
 
 
-def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str, Any]]:
-    """Name and version -> result of the baselines in a chart's folder, in the order of their file names. InputError: a
-    file cannot be read, or is of another number of threads or size of images."""
+def read_baselines(folder: Path, **expected: int) -> dict[str, dict[str, Any]]:
+    """Name and version -> result of the baselines beside a result, in the order of their file names. InputError: a file
+    cannot be read, or has other settings than are expected, such as threads or image_size."""
     baselines = {}
     for path in sorted((folder / "baselines").glob("*.json")):
         result = read_result(path)
@@ -64,10 +61,12 @@ def read_baselines(folder: Path, settings: ChartSettings) -> dict[str, dict[str,
             found = BaselineSettings(**result["settings"])
         except TypeError as problem:
             raise InputError(f"{path}: not a result of edge-se bench baselines ({problem!r})") from problem
-        for key in ("threads", "image_size"):
-            value, expected = getattr(found, key), getattr(settings, key)
-            if value != expected:
-                raise InputError(f"{path}: {key} is {value}, the chart's is {expected}: seconds cannot be compared")
+        for key, value in expected.items():
+            if getattr(found, key) != value:
+                raise InputError(
+                    f"{path}: {key} is {getattr(found, key)}, of the result beside it {value}: "
+                    f"seconds cannot be compared"
+                )
         baselines[f"{found.name} ({found.program_version})"] = result
     return baselines
 
@@ -79,9 +78,9 @@ class TimeIsUp(BaseException):
 class Clock:
     """A program's training seconds, and its PSNR at evaluations."""
 
-    def __init__(self, settings: ChartSettings) -> None:
+    def __init__(self, settings: ChartSettings, eval_seconds: Iterable[float]) -> None:
         self.settings = settings
-        self.due = [seconds for seconds in BASELINE_EVAL_SECONDS if seconds < settings.seconds]
+        self.due = sorted(seconds for seconds in eval_seconds if seconds < settings.seconds)
         self.curve: list[list[float]] = []
         self.steps, self._start = 0, 0.0
 
@@ -103,11 +102,13 @@ class Clock:
         self._start += self.settings.clock() - now
 
 
-def train(settings: BaselineSettings, checkout: Path | None, data: Path, seed: int) -> Run:
-    """Steps and curve of a training; to be called in a fresh process, because programs change what is global.
-    InputError: the program is not there, refuses its flags or ends too soon."""
+def train(
+    settings: BaselineSettings, checkout: Path | None, data: Path, seed: int, eval_seconds: Iterable[float] = ()
+) -> Run:
+    """Steps and curve of a training, evaluated after some seconds and at the end; to be called in a fresh process,
+    because programs change what is global. InputError: the program is not there, refuses its flags or ends too soon."""
     torch.set_num_threads(settings.threads)
-    clock = Clock(settings)
+    clock = Clock(settings, eval_seconds)
     if checkout is not None:
         sys.path.insert(0, str(checkout.resolve()))
     try:
@@ -167,7 +168,7 @@ def _tensorf(clock: Clock, data: Path, folder: Path, seed: int, flags: list[str]
         return [0.0]
 
     program.evaluation = evaluate
-    downsampling = 800 / to_pictures(read_blender(data, "test"))[0].image.shape[1]
+    downsampling = 800 / read_test_pictures(data)[0].image.shape[1]
     sys.argv = [
         "train.py", "--config", str(Path(str(program.__file__)).parent / "configs" / "lego.txt"),
         "--datadir", str(data), "--basedir", str(folder), "--downsample_train", str(downsampling),
@@ -204,11 +205,17 @@ PROGRAMS: dict[str, Callable[[Clock, Path, Path, int, list[str]], None]] = {
 }
 
 
+def read_test_pictures(data: Path) -> list[Picture]:
+    views = read_split(data, "test")
+    if views is None:
+        raise InputError(f"{data}: no test views to evaluate on; add transforms_test.json or a list test_filenames")
+    return to_pictures(views)
+
+
 def mean_psnr(rendered: Sequence[np.ndarray], data: Path) -> float:
-    """Of the test views (H, W, 3) in front of white, the mean over views."""
-    pictures = to_pictures(read_blender(data, "test"))
-    pairs = zip(rendered, pictures, strict=True)
-    return statistics.mean(compute_metrics(np.clip(image, 0, 1), p.image, 1.0)["psnr"] or 0.0 for image, p in pairs)
+    """Of the test views (H, W, 3) in front of white, where their pixels are known: the mean over views."""
+    pairs = [(np.clip(image, 0, 1), p) for image, p in zip(rendered, read_test_pictures(data), strict=True)]
+    return statistics.mean(compute_metrics(image, p.image, 1.0, p.mask)["psnr"] or 0.0 for image, p in pairs)
 
 
 def _seed(seed: int) -> None:

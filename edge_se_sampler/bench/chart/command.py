@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class ChartOptions:
     workplace: Path = Path("bench")
-    """Where synthetic scenes are kept."""
+    """Where synthetic scenes, and copies of others, are kept."""
     data: Path | None = None
-    """Folder with a Blender folder a scene, all of one image size; left out, seven synthetic scenes of 100 x 100."""
+    """Folder with a folder a scene, all of one image size; left out, seven synthetic scenes of 100 x 100."""
     scenes: tuple[str, ...] = ("bricks",)
     """Of the seven, or of --data."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -36,7 +36,6 @@ class ChartOptions:
     def settings(self) -> ChartSettings:
         """InputError if a value has no meaning, or the scenes' images differ in size."""
         from edge_se_sampler.bench.chart.trials import ChartSettings
-        from edge_se_sampler.data.blender import read_blender
         from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF
 
         if not (self.seeds and self.scenes):
@@ -46,11 +45,19 @@ class ChartOptions:
         if self.data is None:
             check_known("scenes", self.scenes, ANALOG_OF)
             return ChartSettings(self.seconds, self.threads)
-        sizes = {scene: max(read_blender(self.data / scene, "train").images[0].shape[:2]) for scene in self.scenes}
+        sizes = {scene: self.image_size(scene) for scene in self.scenes}
         if len(set(sizes.values())) > 1:
             listed = ", ".join(f"{scene} {size}" for scene, size in sizes.items())
             raise InputError(f"--data {self.data}: scenes of different sizes ({listed} pixels): chart them separately")
         return ChartSettings(self.seconds, self.threads, sizes[self.scenes[0]])
+
+    def image_size(self, scene: str) -> int:
+        """The longer side of a scene's first image, pixels."""
+        from edge_se_sampler.data.dataset import read_split
+
+        views = read_split(self.scene_folder(scene), "train")
+        assert views is not None
+        return max(views.images[0].shape[:2])
 
     def scene_folder(self, scene: str) -> Path:
         from edge_se_sampler.bench.train import cached_scene
@@ -74,7 +81,8 @@ class BenchChart(ChartOptions, ExperimentCommand):
 
         check_known("variants", self.variants, VARIANTS)
         settings = self.settings()
-        read_baselines(self.output_dir, settings)  # refuses, before anything is trained, those that cannot be compared
+        # refuses, before anything is trained, those that cannot be compared
+        read_baselines(self.output_dir, threads=settings.threads, image_size=settings.image_size)
         # seed by seed and scene by scene, so that what is compared is trained side by side
         keys = product(self.seeds, self.scenes, self.variants or VARIANTS)
         trials = [Trial(variant, scene, seed) for seed, scene, variant in keys]

@@ -65,7 +65,8 @@ def tables(folder: Path) -> dict[str, str]:
 def _read(folder: Path) -> tuple[dict[str, Any], Baselines, Iterable[dict[str, Any]]]:
     """The result, the baselines' runs, and their results."""
     result = read_result(folder / "result.json")
-    baselines = read_baselines(folder, ChartSettings(**result["settings"]))
+    settings = ChartSettings(**result["settings"])
+    baselines = read_baselines(folder, threads=settings.threads, image_size=settings.image_size)
     return result, {label: baseline["runs"] for label, baseline in baselines.items()}, baselines.values()
 
 

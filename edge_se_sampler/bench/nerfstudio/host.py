@@ -14,17 +14,20 @@ import torch
 
 
 def build_config(method: str, seed: int, data: Path, runs: Path, flags: Sequence[str] = ()) -> Any:
-    """A method's config on a Blender folder, without evaluations on the way; flags: as ns-train takes them."""
+    """A method's config on a Blender folder or on one with a transforms.json, without evaluations on the way; flags: as
+    ns-train takes them."""
     import tyro
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
     from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
     config = copy.deepcopy(tyro.cli(AnnotatedBaseConfigUnion, args=[method, *flags]))
     config.output_dir, config.vis, config.machine.seed = runs, "tensorboard", seed
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
     manager = config.pipeline.datamanager
-    manager.data, manager.dataparser = data, BlenderDataParserConfig()
+    is_capture = (data / "transforms.json").exists()
+    manager.data, manager.dataparser = data, NerfstudioDataParserConfig() if is_capture else BlenderDataParserConfig()
     config.set_timestamp()
     return config
 

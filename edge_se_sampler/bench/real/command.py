@@ -13,15 +13,16 @@ from edge_se_sampler.errors import InputError, check_known, check_value
 
 @dataclass(frozen=True, kw_only=True)
 class BenchReal(ExperimentCommand):
-    """Train lean-nerf on real scenes with time budgets, one training at a time on all cores, and tabulate test PSNR.
-    Resumes."""
+    """Train lean-nerf on real scenes with time budgets, one training at a time on all cores; tabulate and chart test
+    PSNR beside the baselines in the folder. Resumes."""
 
     scenes_dir: Path
-    """Folder of Blender folders, such as those of NeRF-synthetic (lego, chair, ...) with their official splits."""
+    """Folder of scenes in any format that edge-se train reads: Blender folders, such as NeRF-synthetic's (lego, chair,
+    ...) with their official splits, or captures, every 8th image of which is held out."""
     scenes: tuple[str, ...] = ("lego", "chair")
     """Folders in it."""
     downscales: tuple[int, ...] = (2,)
-    """Of NeRF's 800 x 800 pixels."""
+    """Every so many pixels along both axes become one."""
     budgets: tuple[str, ...] = ("1m", "3m")
     """Time budgets, as in edge-se train."""
     variants: tuple[str, ...] = ("lean-nerf",)

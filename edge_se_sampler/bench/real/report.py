@@ -1,36 +1,60 @@
-"""README.md of the trainings on real scenes."""
+"""README.md and picture of the trainings on real scenes."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from edge_se_sampler.bench.baselines.run import read_baselines
+from edge_se_sampler.bench.real.figures import draw_chart
+from edge_se_sampler.bench.real.published import PUBLISHED
+from edge_se_sampler.bench.real.summary import (
+    BASELINE,
+    WITHOUT_MASKS,
+    Panel,
+    best_psnr_at,
+    by_program,
+    label_of,
+    name_of,
+    panel_of,
+    panels_of,
+    psnr_by_budget,
+    seconds_of,
+)
 from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.engine.figures import save_figure
 
-BASELINE = "lean-nerf"
-NERF_PIXELS = 800
-TEST_VIEWS = 25
-Key = tuple[str, int, str]
-"""Scene, downscale, budget."""
+Key = tuple[Panel, str]
+"""Scene and size; budget."""
+Baselines = Mapping[str, Mapping[str, Any]]
+"""Results of other programs."""
+
+
+def draw(folder: Path, workplace: Path | None) -> None:
+    del workplace
+    result, baselines = _read(folder)
+    if result["runs"]:
+        save_figure(draw_chart(result["runs"], baselines), folder / "chart.png")
 
 
 def describe(folder: Path) -> str:
     """The README.md of a folder with a result.json; notes.md has remarks by hand, which no number shows."""
-    result, notes = read_result(folder / "result.json"), folder / "notes.md"
+    (result, baselines), notes = _read(folder), folder / "notes.md"
     runs = [run for run in result["runs"] if run["variant"] == BASELINE]
     return fill_template(
         __file__,
         folder,
-        test_views=TEST_VIEWS,
         psnr=_table_of_psnr(runs),
+        baselines=_table_of_baselines(result["runs"], baselines),
+        published=_table_of_published(),
         notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
         gaps=_table_of(runs, {"test": "psnr", "SSIM": "ssim", "validation": "val_psnr", "training": "train_psnr"}),
         costs=_table_of_costs(runs),
         variants=_table_of_variants(result["runs"]),
-        reproduce=describe_command(result),
+        reproduce=describe_command(*baselines.values(), result),
     )
 
 
@@ -40,43 +64,77 @@ def tables(folder: Path) -> dict[str, str]:
     return {"real": _table_of_psnr([run for run in runs if run["variant"] == BASELINE])}
 
 
-def _key(run: Run) -> Key:
-    return run["scene"], run["downscale"], run["budget"]
+def _read(folder: Path) -> tuple[dict[str, Any], Baselines]:
+    """The result, and those of other programs beside it, which had as many threads."""
+    result = read_result(folder / "result.json")
+    return result, read_baselines(folder, threads=result["machine"]["threads"])
 
 
 def _by_key(runs: list[Run]) -> dict[Key, list[Run]]:
-    keys = sorted({_key(run) for run in runs}, key=lambda key: (-key[1], key[0], _seconds(key[2])))
-    return {key: [run for run in runs if _key(run) == key] for key in keys}
+    groups = {}
+    for panel in panels_of(runs):
+        of_panel = [run for run in runs if panel_of(run) == panel]
+        for budget in _budgets(of_panel):
+            groups[panel, budget] = [run for run in of_panel if run["budget"] == budget]
+    return groups
 
 
-def _seconds(budget: str) -> float:
-    return float(budget.rstrip("smh")) * {"m": 60, "h": 3600}.get(budget[-1], 1)
-
-
-def _label(key: Key) -> str:
-    return f"{key[0]}, {NERF_PIXELS // key[1]} px"
+def _budgets(runs: list[Run]) -> list[str]:
+    return sorted({run["budget"] for run in runs}, key=seconds_of)
 
 
 def _median(runs: list[Run], name: str) -> float:
     return statistics.median(run[name] for run in runs)
 
 
+def _show_median(runs: list[Run], name: str) -> str:
+    """A dash where there is none: captures have no validation views of their own."""
+    return "–" if any(run[name] is None for run in runs) else decimals(_median(runs, name))
+
+
 def _table_of_psnr(runs: list[Run]) -> str:
     """Scenes and sizes by budgets; in brackets the least and the largest of several seeds."""
-    groups = _by_key(runs)
-    budgets = sorted({key[2] for key in groups}, key=_seconds)
-    rows = {}
-    for key, group in groups.items():
+    budgets, rows = _budgets(runs), {}
+    for (panel, budget), group in _by_key(runs).items():
         psnrs = sorted(run["psnr"] for run in group)
         spread = f" ({decimals(psnrs[0])} to {decimals(psnrs[-1])})" if len(psnrs) > 1 else ""
-        rows.setdefault(_label(key), dict.fromkeys(budgets, "–"))[key[2]] = decimals(_median(group, "psnr")) + spread
+        row = rows.setdefault(label_of(panel), dict.fromkeys(budgets, "–"))
+        row[budget] = decimals(_median(group, "psnr")) + spread
     return markdown_table(["", *budgets], ([label, *row.values()] for label, row in rows.items()))
+
+
+def _table_of_baselines(runs: list[Run], baselines: Baselines) -> str:
+    """Ours and other programs where both were trained, at the seconds of our budgets there; empty where none was."""
+    budgets, rows = _budgets(runs), []
+    for panel in panels_of(runs):
+        ours = [run for run in runs if panel_of(run) == panel]
+        psnr: dict[str, dict[str, float | None]] = {}
+        for variant in (BASELINE, WITHOUT_MASKS):
+            found = psnr_by_budget([run for run in ours if run["variant"] == variant])
+            psnr[name_of(variant)] = {budget: statistics.median(of_seeds) for budget, of_seeds in found.items()}
+        programs = by_program(baselines, panel)
+        for name, trainings in programs.items():
+            psnr[name] = {budget: best_psnr_at(trainings, seconds_of(budget)) for budget in _budgets(ours)}
+        rows += [
+            [label_of(panel), name, *(decimals(found.get(budget)) for budget in budgets)]
+            for name, found in psnr.items()
+            if programs and found
+        ]
+    return markdown_table(["", "program", *budgets], rows) if rows else ""
+
+
+def _table_of_published() -> str:
+    scenes = list(dict.fromkeys(scene for published in PUBLISHED for scene in published.psnr))
+    rows = (
+        [f"{p.method} ({p.source})", *(decimals(p.psnr.get(scene)) for scene in scenes), p.training] for p in PUBLISHED
+    )
+    return markdown_table(["", *scenes, "training"], rows)
 
 
 def _table_of(runs: list[Run], columns: dict[str, str]) -> str:
     rows = (
-        [_label(key), key[2], *(decimals(_median(group, name)) for name in columns.values())]
-        for key, group in _by_key(runs).items()
+        [label_of(panel), budget, *(_show_median(group, name) for name in columns.values())]
+        for (panel, budget), group in _by_key(runs).items()
     )
     return markdown_table(["", "budget", *columns], rows)
 
@@ -90,19 +148,24 @@ def _table_of_costs(runs: list[Run]) -> str:
         "memory": lambda group: f"{_median(group, 'memory'):.1f} GiB",
         "rendering a view": lambda group: f"{_median(group, 'seconds_per_view'):.2f} s",
     }
-    rows = ([_label(key), key[2], *(show(group) for show in columns.values())] for key, group in _by_key(runs).items())
+    rows = (
+        [label_of(panel), budget, *(show(group) for show in columns.values())]
+        for (panel, budget), group in _by_key(runs).items()
+    )
     return markdown_table(["", "budget", *columns], rows)
 
 
 def _table_of_variants(runs: list[Run]) -> str:
     """Empty where nothing was changed."""
     rows: list[list[Any]] = []
-    for key, group in _by_key(runs).items():
+    for (panel, budget), group in _by_key(runs).items():
         for variant in sorted({run["variant"] for run in group} - {BASELINE}):
             changed = [run for run in group if run["variant"] == variant]
             seeds = {run["seed"] for run in changed}
             baseline = [run for run in group if run["variant"] == BASELINE and run["seed"] in seeds]
             if len(baseline) == len(changed):
                 psnr, before = _median(changed, "psnr"), _median(baseline, "psnr")
-                rows.append([_label(key), key[2], variant, decimals(psnr), f"{psnr - before:+.2f}", str(len(seeds))])
+                rows.append(
+                    [label_of(panel), budget, variant, decimals(psnr), f"{psnr - before:+.2f}", str(len(seeds))]
+                )
     return markdown_table(["", "budget", "changed", "PSNR", "difference", "seeds"], rows) if rows else ""

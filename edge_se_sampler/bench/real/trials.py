@@ -13,11 +13,11 @@ import numpy as np
 
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.runner import Run, run_in_subprocess
-from edge_se_sampler.data.blender import read_blender
-from edge_se_sampler.data.frames import LoadSettings
+from edge_se_sampler.data.capture import Split
+from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.engine.config import MODEL, SAMPLER, override
 from edge_se_sampler.engine.evaluation import evaluate
-from edge_se_sampler.engine.rendering import Picture, to_pictures
+from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.methods import method_configs
 
@@ -62,7 +62,8 @@ def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -
     """Train in a process of its own, and measure on test, validation and some training views.
 
     Returns:
-        PSNR on each, SSIM on the test views; steps; seconds of the budget that were used, and CPU seconds; rows of the
+        size of the images, width and height in pixels; PSNR on each split, None where validation views are the test
+        views; SSIM on the test views; steps; seconds of the budget that were used, and CPU seconds; rows of the
         finest cells; the process's peak of resident memory, GiB; seconds that rendering a test view takes.
     """
     return run_in_subprocess(_train_and_measure, trial, scenes, workplace, settings)
@@ -89,10 +90,11 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
     results = evaluate(model, pictures)
     seconds_per_view = (time.monotonic() - start) / len(pictures)
     return {
+        "size": list(pictures[0].image.shape[1::-1]),
         "psnr": round(results["psnr"], 3),
         "ssim": round(results["ssim"], 4),
-        "val_psnr": _mean_psnr(model, _pictures(trial, scenes, "val")),
-        "train_psnr": _mean_psnr(model, _pictures(trial, scenes, "train", settings.num_train_views)),
+        "val_psnr": _mean_psnr(model, trial, scenes, "val"),
+        "train_psnr": _mean_psnr(model, trial, scenes, "train", settings.num_train_views),
         "steps": trainer.next_step,
         "seconds": round(trainer.elapsed + trainer.setup_seconds, 2),
         "cpu_seconds": round(cpu_seconds, 2),
@@ -103,12 +105,11 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
     }
 
 
-def _pictures(trial: Trial, scenes: Path, split: Any, count: int | None = None) -> list[Picture]:
-    views = read_blender(scenes / trial.scene, split, LoadSettings(downscale=trial.downscale))
+def _mean_psnr(model: Any, trial: Trial, scenes: Path, split: Split, count: int | None = None) -> float | None:
+    """On a split, or on so many of its views; None if there is no such split, or it is the test split."""
+    views = read_split(scenes / trial.scene, split, DataSettings(downscale=trial.downscale))
+    if views is None or (split == "val" and views.eval_every is not None):
+        return None
     if count is not None:
         views = views.subset(np.linspace(0, len(views.names) - 1, count).astype(int).tolist())
-    return to_pictures(views)
-
-
-def _mean_psnr(model: Any, pictures: list[Picture]) -> float:
-    return round(evaluate(model, pictures)["psnr"], 3)
+    return round(evaluate(model, to_pictures(views))["psnr"], 3)
