@@ -270,4 +270,4 @@ def test_baselines_that_cannot_be_compared_are_refused_before_training(tmp_path:
     folder = folder_of(tmp_path, [], baseline([("bricks", 0, [[1, 20.0]])]))
     answer = edge_se("bench", "chart", "--output-dir", folder, "--threads", "2")
     assert answer.code == 2, answer
-    assert "threads is 1, the chart's is 2" in answer.err
+    assert "threads is 1, that of the result beside it 2" in answer.err

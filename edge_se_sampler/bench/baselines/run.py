@@ -64,8 +64,8 @@ def read_baselines(folder: Path, **expected: int) -> dict[str, dict[str, Any]]:
         for key, value in expected.items():
             if getattr(found, key) != value:
                 raise InputError(
-                    f"{path}: {key} is {getattr(found, key)}, of the result beside it {value}: "
-                    f"seconds cannot be compared"
+                    f"{path}: {key} is {getattr(found, key)}, that of the result beside it {value}: "
+                    "seconds cannot be compared"
                 )
         baselines[f"{found.name} ({found.program_version})"] = result
     return baselines

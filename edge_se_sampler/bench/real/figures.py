@@ -60,9 +60,10 @@ def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> A
     for axis in axes.flat:
         handles |= {label: line for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(
-        handles.values(), handles, loc="outside lower center", ncols=3, handlelength=3, fontsize=8, frameon=False
+        handles.values(), handles, loc="outside lower center", ncols=2, handlelength=3, fontsize=8, frameon=False
     )
-    figure.suptitle("test PSNR [dB] over training time; bands: least to greatest of the seeds", fontsize=10)
+    title = "test PSNR [dB] over training time; bands: least to greatest of the seeds; gray: published, on GPUs"
+    figure.suptitle(title, fontsize=9)
     return figure
 
 
@@ -86,5 +87,5 @@ def _draw_curve(axis: Any, runs: Trainings, **style: Any) -> None:
 def _draw_published(axis: Any, scene: str) -> None:
     for mark, published in zip(MARKS, PUBLISHED, strict=True):
         if scene in published.psnr:
-            label = f"{published.method}, {published.training} (published)"
+            label = f"{published.method}, {published.training}"
             axis.plot(published.seconds, published.psnr[scene], mark, color="gray", markersize=6, label=label)
