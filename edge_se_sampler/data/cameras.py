@@ -38,9 +38,8 @@ class RayBundle:
         directions = (center[:, None] + quarters @ self.metadata["pixel_axes"]).reshape(-1, 3)
         norm = directions.norm(dim=1, keepdim=True)
         origins, camera_indices = (x.repeat_interleave(4, dim=0) for x in (self.origins, self.camera_indices))
-        bounds = {
-            key: self.metadata[key].repeat_interleave(4, dim=0) for key in self.metadata.keys() & {"nears", "fars"}
-        }
+        kept = {"nears", "fars"} & self.metadata.keys()
+        bounds = {key: self.metadata[key].repeat_interleave(4, dim=0) for key in kept}
         return RayBundle(origins, directions / norm, camera_indices, {"directions_norm": norm, **bounds})
 
 
