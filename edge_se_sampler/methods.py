@@ -35,7 +35,8 @@ def _nerf(name: str, model: NeRFModelConfig, early: str, late: str, description:
     return MethodSpecification(TrainerConfig(method_name=name, pipeline=pipeline), description)
 
 
-def _lean_nerf() -> MethodSpecification:
+def lean_nerf() -> MethodSpecification:
+    """The method that is recommended."""
     sampler = EdgeSEPixelSamplerConfig(early="auto", late="se", error_source="cached", images_per_step="all")
     manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
     adam = OptimizerConfig(eps=1e-15, beta2=0.99, warmup_steps=20, fused=True)
@@ -68,7 +69,7 @@ def registered_methods() -> dict[str, RegisteredMethod]:
         # the paper's other model takes the other strategies by flags
         _nerf("info-nerf", InfoNeRFModelConfig(), "uniform", "uniform", info_nerf),
         _nerf("edge-se-info-nerf", InfoNeRFModelConfig(), "edge", "se", "Edge + SE on InfoNeRF"),
-        _lean_nerf(),
+        lean_nerf(),
     ]
     methods = {method.config.method_name: RegisteredMethod(method, "edge_se_sampler") for method in own_methods}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):

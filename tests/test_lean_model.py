@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -294,6 +295,47 @@ def test_a_supersampled_pixel_is_the_mean_of_its_quarters() -> None:
         torch.testing.assert_close(pixels[key], expected)
         assert (pixels[key] - center[key]).abs().max() > 1e-3
     assert pixels["depth_fine"].shape == (50, 1)
+
+
+@pytest.mark.parametrize("supersampled", [False, True])
+def test_a_host_may_bound_rays(supersampled: bool) -> None:
+    """Between distances of its own instead of the depths, of each of a pixel's rays."""
+    model = full_model().eval()
+    with torch.no_grad():
+        model.density.fill_(2.0)
+    model.supersampled.fill_(supersampled)
+    rays = tiny_rays(50, dtype=torch.float32)
+    opacity = model(rays)["accumulation_fine"]
+    hit = opacity[:, 0] > 0.9
+    assert hit.sum() > 10
+
+    def bounded(near: float, far: float) -> torch.Tensor:
+        nears, fars = (torch.full((50, 1), value) for value in (near, far))
+        return model(replace(rays, metadata=rays.metadata | {"nears": nears, "fars": fars}))["accumulation_fine"]
+
+    torch.testing.assert_close(bounded(0.0, 100.0), opacity)
+    middle = rays.origins.norm(dim=1).mean()
+    assert bounded(0.0, float(middle) - 2).max() == 0
+    assert bounded(float(middle) + 2, 100.0).max() == 0
+    assert 0 < bounded(0.0, float(middle))[hit].mean() <= opacity[hit].mean()
+
+
+def test_cells_are_subdivided_though_a_host_still_holds_the_last_loss() -> None:
+    """nerfstudio's trainer does: the graph of a loss remembers how many rows there were."""
+    model, rays, batch = full_model(), tiny_rays(50, dtype=torch.float32), {"image": torch.rand(50, 4)}
+
+    def loss() -> torch.Tensor:
+        found = model.training_loss(rays, batch)[0].mean()
+        found.backward()
+        return found
+
+    held = loss()
+    model.grid.update_max_weight(torch.arange(512), torch.ones(512))
+    assert model.update_cells(0.2, 0.21)
+    loss()
+    assert model.density.grad is not None
+    assert model.density.grad.shape == model.density.shape
+    del held
 
 
 @pytest.mark.parametrize(

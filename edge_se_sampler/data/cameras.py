@@ -21,7 +21,8 @@ class RayBundle:
     camera_indices: Tensor  # (n, 1) int64
     metadata: dict[str, Tensor]
     """"directions_norm" (n, 1): length of the direction whose depth along the axis is 1; "pixel_axes" (n, 2, 3): what
-    that changes by from a pixel to the one below, and to the one on the right."""
+    that changes by from a pixel to the one below, and to the one on the right. A host's may have "nears" and "fars"
+    (n, 1): distances from the origin, world units, between which the ray is sampled instead of the model's depths."""
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -37,7 +38,9 @@ class RayBundle:
         directions = (center[:, None] + quarters @ self.metadata["pixel_axes"]).reshape(-1, 3)
         norm = directions.norm(dim=1, keepdim=True)
         origins, camera_indices = (x.repeat_interleave(4, dim=0) for x in (self.origins, self.camera_indices))
-        return RayBundle(origins, directions / norm, camera_indices, {"directions_norm": norm})
+        kept = {"nears", "fars"} & self.metadata.keys()
+        bounds = {key: self.metadata[key].repeat_interleave(4, dim=0) for key in kept}
+        return RayBundle(origins, directions / norm, camera_indices, {"directions_norm": norm, **bounds})
 
 
 @dataclass(frozen=True)

@@ -56,18 +56,36 @@ class RowAdam(torch.optim.Adam):
 
 def create_adam(groups: Sequence[ParameterGroup], preset: SizePreset, config: OptimizerConfig) -> RowAdam:
     """Adam over groups of weights, for the training that a preset without open numbers describes."""
-    parts = [
+    return build_adam(torch_groups(groups, preset.learning_rate, preset.rays), config)
+
+
+def torch_groups(groups: Sequence[ParameterGroup], learning_rate: float, rays: int) -> list[dict[str, Any]]:
+    """Groups of weights as torch's optimizers and `RowAdam` take them, for trainings of so many rays a step."""
+    return [
         {
             "params": group.parameters,
-            "lr": preset.learning_rate * group.lr_scale,
+            "lr": learning_rate * group.lr_scale,
             "maximum": group.maximum,
             # the loss is a mean over rays and channels
-            "total_variation": group.total_variation / (3 * preset.rays),
+            "total_variation": group.total_variation / (3 * rays),
         }
         for group in groups
     ]
+
+
+def build_adam(groups: list[dict[str, Any]], config: Any) -> RowAdam:
+    """Adam over torch's groups, by an `OptimizerConfig` or what has the same fields."""
     betas = (0.9, config.beta2)
     if config.fused:
         with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
-            return RowAdam(parts, betas=betas, eps=config.eps, fused=True)
-    return RowAdam(parts, betas=betas, eps=config.eps)
+            return RowAdam(groups, betas=betas, eps=config.eps, fused=True)
+    return RowAdam(groups, betas=betas, eps=config.eps)
+
+
+def learning_rate_factor(config: Any, progress: float, step: int) -> float:
+    """Learning rate of a step as a share of the initial one, by an `OptimizerConfig` or what has the same fields.
+
+    Args:
+        progress: part of the training, in [0, 1], that is done when the step begins.
+    """
+    return config.final_fraction**progress * min(1.0, (step + 1) / (config.warmup_steps + 1))

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import write_image
-from edge_se_sampler.engine.optimizers import create_adam
+from edge_se_sampler.engine.optimizers import create_adam, learning_rate_factor
 from edge_se_sampler.engine.pipeline import Pipeline, load_weights
 from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.engine.progress import Progress
@@ -67,8 +67,7 @@ class Trainer:
         return self.plan.progress(step)
 
     def _learning_rate_factor(self, step: int) -> float:
-        decay, warmup = self.config.optimizer.final_fraction, self.config.optimizer.warmup_steps
-        return decay ** self.progress(step) * min(1.0, (step + 1) / (warmup + 1))
+        return learning_rate_factor(self.config.optimizer, self.progress(step), step)
 
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint's state; InputError if it is another model's."""

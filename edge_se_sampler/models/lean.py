@@ -137,14 +137,18 @@ class LeanModel(RayModel):
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`; depth_fine in evaluation alone."""
-        return self._render(rays)[0]
+        return self.render(rays)[0]
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """As `RayModel`; remembers the largest weight in each cell."""
-        outputs, rendered = self._render(rays)
+        outputs, rendered = self.render(rays)
+        self.remember(rendered)
+        return self.loss(outputs, batch)
+
+    def remember(self, rendered: Rendered) -> None:
+        """Remember the largest weight in each cell of what training has rendered, if cells are to be subdivided yet."""
         if self.grid.level < self.grid.max_level:
             self.grid.update_max_weight(rendered.cells, rendered.weights)
-        return self.loss(outputs, batch)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """As `RayModel`; plus, where there is alpha, the squared error of the accumulated opacity."""
@@ -154,7 +158,7 @@ class LeanModel(RayModel):
             loss = loss + self.config.alpha_loss / 3 * batch.get("weight", 1.0) * difference.square()
         return loss, error
 
-    def _render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
+    def render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
         """Outputs of `forward`, and what they were made of."""
         split = rays.split_pixels() if self.supersampled else rays
         spans, jitter = self._spans(split), self.uniform(len(split), 1)[:, 0] if self.training else None
@@ -176,14 +180,16 @@ class LeanModel(RayModel):
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
         norm = rays.metadata["directions_norm"][:, 0] / float(cell_size)
-        near, far = self.config.depths
+        near, far = (depth * norm for depth in self.config.depths)
+        if "nears" in rays.metadata:
+            near, far = (rays.metadata[name][:, 0] / float(cell_size) for name in ("nears", "fars"))
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
         return RaySpans(
             origins,
             rays.directions,
-            torch.maximum(begin, near * norm),
-            torch.minimum(end, far * norm),
+            torch.maximum(begin, near),
+            torch.minimum(end, far),
         )
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
@@ -260,8 +266,10 @@ class LeanModel(RayModel):
             return False
         ratio = float(finer.cell_size / grid.cell_size)
         for parameter in (self.density, self.features):
-            parameter.grad = None
-            parameter.data = choose_ops(self.density).resample(finer.bricks, ratio, grid.numbers, parameter.data)
+            values, parameter.grad = parameter.data, None
+            # of another type, so that torch forgets the shape, which a graph that the host still holds would keep
+            parameter.data = values.new_empty(0, dtype=torch.float16)
+            parameter.data = choose_ops(values).resample(finer.bricks, ratio, grid.numbers, values)
         self.grid = finer
         self.update_sampled()
         return True

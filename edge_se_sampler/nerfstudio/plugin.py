@@ -7,6 +7,7 @@ Must not import nerfstudio.configs.method_configs, which loads this module by it
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -21,8 +22,11 @@ from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from edge_se_sampler.methods import STRATEGIES
+from edge_se_sampler.methods import STRATEGIES, lean_nerf
+from edge_se_sampler.models.config import LEAN_PRESETS
 from edge_se_sampler.nerfstudio.datamanager import EdgeSEDataManagerConfig
+from edge_se_sampler.nerfstudio.lean_datamanager import LeanDataManagerConfig
+from edge_se_sampler.nerfstudio.lean_model import GROUP, LeanNerfModelConfig, RowAdamConfig
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSamplerConfig
 
 
@@ -74,5 +78,27 @@ def _nerfacto() -> MethodSpecification:
     return MethodSpecification(config, "Nerfacto, its pixels drawn by edge strength first, then by squared error")
 
 
-METHODS = {name: _nerf(name) for name in STRATEGIES if name != "vanilla-nerf"} | {"edge-se-nerfacto": _nerfacto()}
+def _lean_nerf() -> MethodSpecification:
+    """The standalone program's method, with its settings for images of more than 256 pixels."""
+    standalone, preset = lean_nerf(), LEAN_PRESETS["paper"]
+    parts, adam = standalone.config.pipeline, replace(standalone.config.optimizer, lr=preset.learning_rate)
+    manager = LeanDataManagerConfig(
+        dataparser=NerfstudioDataParserConfig(),
+        train_num_rays_per_batch=preset.rays,
+        pixel_sampler=EdgeSEPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler)),
+    )
+    config = TrainerConfig(
+        method_name="lean-nerf",
+        max_num_iterations=preset.iterations,
+        steps_per_save=2000,
+        pipeline=VanillaPipelineConfig(datamanager=manager, model=LeanNerfModelConfig(lean=parts.model)),
+        optimizers={GROUP: {"optimizer": RowAdamConfig(**vars(adam)), "scheduler": None}},
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    )
+    return MethodSpecification(config, standalone.description)
+
+
+METHODS = {name: _nerf(name) for name in STRATEGIES if name != "vanilla-nerf"}
+METHODS |= {"edge-se-nerfacto": _nerfacto(), "lean-nerf": _lean_nerf()}
 """By name. vanilla-nerf is left out: nerfstudio has it, and a plugin's would silently replace it."""

@@ -37,7 +37,7 @@ def config_of(
     manager.train_num_rays_per_batch = manager.eval_num_rays_per_batch = rays
     if hasattr(model, "num_coarse_samples"):
         model.num_coarse_samples = model.num_importance_samples = 8
-    else:
+    elif hasattr(model, "log2_hashmap_size"):
         model.log2_hashmap_size = 10
         model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (16, 8), 8
     for key, value in changes.items():
@@ -45,9 +45,9 @@ def config_of(
     return config
 
 
-def trainer_of(config: Any) -> Any:
-    """nerfstudio's trainer, set up as `ns-train` does."""
-    return build_trainer(config, "val")
+def trainer_of(config: Any, test_mode: str = "val") -> Any:
+    """nerfstudio's trainer, set up as `ns-train` does, or with the test views in place of val's."""
+    return build_trainer(config, test_mode)
 
 
 def max_num_iterations(start: int, more: int) -> int:

@@ -29,6 +29,7 @@ SMALL = {
         *("--pipeline.model.num-proposal-samples-per-ray", "16", "8"),
         *("--pipeline.model.predict-normals", "True"),  # what pointcloud export asks for
     ],
+    "lean-nerf": [],
 }
 
 
@@ -95,7 +96,15 @@ def test_help_names_the_methods_and_their_flags() -> None:
         return " ".join(ns("train", *arguments, "--help").replace("│", " ").split())
 
     methods = help_of()
-    for method in ("edge-nerf", "edge-se-nerf", "se-nerf", "precrop-nerf", "precrop-se-nerf", "edge-se-nerfacto"):
+    for method in (
+        "edge-nerf",
+        "edge-se-nerf",
+        "se-nerf",
+        "precrop-nerf",
+        "precrop-se-nerf",
+        "edge-se-nerfacto",
+        "lean-nerf",
+    ):
         assert method in methods
     assert "by edge strength first, then by squared error" in methods
     flags = help_of("edge-se-nerf")

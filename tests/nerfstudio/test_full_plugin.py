@@ -15,7 +15,7 @@ import pytest
 pytestmark = pytest.mark.nerfstudio_full
 pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio 1.1.5")
 
-OURS = {"edge-nerf", "edge-se-nerf", "se-nerf", "precrop-nerf", "precrop-se-nerf", "edge-se-nerfacto"}
+OURS = {"edge-nerf", "edge-se-nerf", "se-nerf", "precrop-nerf", "precrop-se-nerf", "edge-se-nerfacto", "lean-nerf"}
 
 
 def answer(code: str) -> tuple[Any, str]:
