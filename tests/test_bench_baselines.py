@@ -194,7 +194,7 @@ def test_a_file_of_another_format_is_refused(content: Any, tmp_path: Path) -> No
 def test_times_of_other_threads_or_image_sizes_are_refused(field: str, value: int, tmp_path: Path) -> None:
     write_baseline(tmp_path, json.dumps({**RESULT, "settings": {**SETTINGS, field: value}}))
     assert list(read_baselines(tmp_path, **{field: value})) == ["other (1)"]
-    with pytest.raises(InputError, match=rf"other.json: {field} is {value}, of the result beside it 100"):
+    with pytest.raises(InputError, match=rf"other.json: {field} is {value}, that of the result beside it 100"):
         read_baselines(tmp_path, **{field: 100})
 
 
