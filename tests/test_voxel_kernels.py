@@ -67,7 +67,7 @@ def render(ops: ModuleType, marching: Marching = MARCHING) -> Rendered:
 def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-4) -> None:
     """Equal to a part of the largest value."""
     assert found.shape == expected.shape
-    assert float((found - expected).detach().abs().max()) <= tolerance * float(expected.abs().max())
+    assert float((found - expected).detach().abs().max()) <= tolerance * float(expected.detach().abs().max())
 
 
 @pytest.mark.parametrize("step", [0.3, 1.0, 2.5])
