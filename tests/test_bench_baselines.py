@@ -78,7 +78,7 @@ def checkout(folder: Path, name: str, text: str) -> Path:
     return folder
 
 
-def test_the_clock_stands_still_during_an_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_clock_stands_still_during_an_evaluation_and_while_others_read(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(ChartSettings, "clock", lambda _: now[0])
     clock = Clock(ChartSettings(seconds=10), (7, 2, 20))
@@ -92,7 +92,12 @@ def test_the_clock_stands_still_during_an_evaluation(monkeypatch: pytest.MonkeyP
             now[0] += 1.5
             clock.after_step(evaluate)
 
+    def is_ready() -> bool:
+        now[0] += 30
+        return now[0] > 300
+
     clock.start()
+    clock.wait(is_ready)
     with pytest.raises(TimeIsUp):
         take_steps()
     assert clock.steps == 7

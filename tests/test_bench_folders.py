@@ -39,7 +39,7 @@ def assert_same_views(found: Views, expected: Views) -> None:
 
 def test_a_blender_folder_stays_one(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
-    for split, count in zip(SPLITS, (3, 1, 12), strict=True):  # more than ten: names must keep the order
+    for split, count in zip(SPLITS, (3, 1, 12), strict=True):
         write_scene(scene, count, split)
     copy = copied_scene(tmp_path / "work", scene, downscale=2)
     assert find_format(copy) == "blender"
@@ -48,8 +48,10 @@ def test_a_blender_folder_stays_one(tmp_path: Path) -> None:
         assert_same_views(found, read(scene, split, downscale=2))
         assert found.depths == (2, 6)
         top = json.loads((copy / f"transforms_{split}.json").read_text())
+        paths = [frame["file_path"] for frame in top["frames"]]
+        assert paths == sorted(paths)  # of more than ten, too
         # as NeRF's programs read it: no suffix, and an angle that says all
-        assert (copy / f"{top['frames'][0]['file_path']}.png").exists()
+        assert (copy / f"{paths[0]}.png").exists()
         assert float(found.cameras.fx[0]) == pytest.approx(3 / 2 / np.tan(top["camera_angle_x"] / 2))
     marker = copy / "kept"
     marker.touch()
