@@ -16,7 +16,6 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.utils import colormaps
 from torch import Tensor
-from torchmetrics.functional import structural_similarity_index_measure
 
 from edge_se_sampler import protocol
 from edge_se_sampler.data.cameras import RayBundle
@@ -103,6 +102,8 @@ class LeanNerfModel(Model):
 
     def get_image_metrics_and_images(self, outputs: Any, batch: Any) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR and SSIM. LPIPS, whose weights would have to be downloaded, is left out."""
+        from torchmetrics.functional import structural_similarity_index_measure  # as slow to import as all the rest
+
         target, rgb, accumulation = self._target(batch), outputs["rgb"], outputs["accumulation"]
         of_batch = (image.permute(2, 0, 1)[None] for image in (target, rgb))
         ssim = structural_similarity_index_measure(*of_batch, data_range=1.0)
