@@ -17,12 +17,13 @@ import torch
 pytestmark = pytest.mark.nerfstudio_full
 pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio 1.1.5")
 
-from capture_folder import COLUMN_STEP, FX, OPENCV, ROW_STEP, Distortion, write_transforms  # noqa: E402
-from full_host import config_of, train, trainer_of  # noqa: E402
+from capture_folder import COLUMN_STEP, FX, HEIGHT, OPENCV, ROW_STEP, WIDTH, Distortion, write_transforms  # noqa: E402
+from full_host import config_of, train, trainer_of, watch  # noqa: E402
 from nerfstudio.cameras.rays import RayBundle as HostRays  # noqa: E402
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig  # noqa: E402
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: E402
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: E402
+from test_full_batches import nerfstudio_folder  # noqa: E402
 
 from edge_se_sampler.bench.nerfstudio.host import render_test_views  # noqa: E402
 from edge_se_sampler.data.synthetic.folder import make_scenes  # noqa: E402
@@ -192,9 +193,33 @@ def test_without_alpha_it_learns_where_the_object_is(scene: Path, tmp_path: Path
     assert psnr_of(trainer.pipeline) > 26
 
 
+@pytest.mark.parametrize("mixed", [False, True])
+def test_masks_of_the_data_hold(mixed: bool, host_scene: Path, tmp_path: Path) -> None:
+    config = lean_config(nerfstudio_folder(tmp_path, host_scene, mixed=mixed, masked=True, channels=4), tmp_path)
+    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(train_split_fraction=0.8)
+    trainer = trainer_of(config)
+    manager = trainer.pipeline.datamanager
+    batch = manager.train_image_dataloader.cached_collated_batch
+    assert isinstance(batch["mask"], list) == mixed
+    for image, mask in zip(batch["image"], batch["mask"], strict=True):
+        assert mask.any()
+        assert not mask[:, image.shape[1] // 2 :].any()
+    seen = watch(manager.train_pixel_sampler)
+    train(trainer, 2)
+    drawn = torch.cat([indices for *_, indices in seen])
+    masks = dict(zip(batch["image_idx"].tolist(), batch["mask"], strict=True))
+    assert all(masks[number][row, column] for number, row, column in drawn.tolist())
+
+
 def capture(folder: Path, distortion: Distortion) -> Any:
-    """The data parser's training views of a capture whose colors are their pixels' coordinates."""
-    write_transforms(folder, distortion)
+    """The data parser's training views of a capture whose colors are their pixels' coordinates, with masks: True in the
+    left half."""
+    document = write_transforms(folder, distortion)
+    mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    mask[:, : WIDTH // 2] = 255
+    iio.imwrite(folder / "mask.png", mask)
+    document["frames"] = [frame | {"mask_path": "mask.png"} for frame in document["frames"]]
+    (folder / "transforms.json").write_text(json.dumps(document))
     parser = NerfstudioDataParserConfig(data=folder, downscale_factor=1, eval_mode="all").setup()
     return parser.get_dataparser_outputs("train")
 
@@ -214,6 +239,10 @@ def test_a_lens_is_undone_as_nerfstudios_rays_bend(tmp_path: Path) -> None:
     )
     assert off < 0.25 / FX  # of a pixel: colors are rounded
     assert undone > 0.5 / FX
+    assert views.masks is not None
+    left = coords[..., 1].numpy() - WIDTH // 2  # of the middle, which is not a pixel's center
+    assert views.masks[1][left < -0.6].all()
+    assert not views.masks[1][left > -0.4].any()
 
 
 @pytest.mark.parametrize(
