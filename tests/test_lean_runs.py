@@ -11,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from test_lean_model import VIEWS, config_of
+from lean_models import VIEWS, config_of
 from tiny import tiny_trainer
 
 from edge_se_sampler.data.blender import read_blender

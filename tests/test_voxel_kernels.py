@@ -233,7 +233,7 @@ def signatures():
 
 lean.compile_ops("cpu")
 compiled = signatures()
-from test_lean_model import config_of, steps_of, VIEWS
+from lean_models import config_of, steps_of, VIEWS
 from tiny import tiny_trainer
 steps_of(tiny_trainer(config_of(30), VIEWS), 30)
 assert signatures() == compiled, (compiled, signatures())
@@ -247,7 +247,7 @@ def test_nothing_is_left_to_compile_when_the_clock_runs() -> None:
 THREADS = """
 import torch
 torch.set_num_threads(1)
-from test_lean_model import config_of, steps_of, VIEWS
+from lean_models import config_of, steps_of, VIEWS
 from tiny import tiny_trainer
 trainer = tiny_trainer(config_of(30), VIEWS)
 steps_of(trainer, 2)
