@@ -246,6 +246,43 @@ def test_what_is_masked_may_be_the_object() -> None:
     assert missed(views, hull_of(hidden)) > 0
 
 
+def test_what_one_view_alone_sees_it_carves() -> None:
+    """Another view looks past half of the box, and knows nothing of what is outside of its image."""
+    views = views_of(rods(), count=2)
+    views = with_masks(views, lambda i, alpha: np.where((np.arange(100) < 3) & (i == 1), np.uint8(255), alpha))
+    views = with_cameras(views, cx=views.cameras.cx + torch.tensor([[0.0], [60.0]]))
+    silhouettes, box = find_silhouettes(views), find_box(views, 2, 6)
+    assert not silhouettes[1].uncropped
+    size = 3 * box.pixel_footprint
+
+    def count_empty(hull: Hull | None) -> int:
+        """Cells that only the first view sees, all of them, as background."""
+        assert hull is not None
+        centers = hull.aabb_min + (np.argwhere(hull.cells) + 0.5) * hull.cell_size
+        low, high, _ = project_cells(views.cameras, 0, centers, hull.cell_size)
+        *other, side = project_cells(views.cameras, 1, centers, hull.cell_size)
+        unseen = (side == hull_module.IN_FRONT) & ((other[1] <= 0) | (other[0] >= 100)).any(axis=0)
+        inside = ((low >= 0) & (high <= 100)).all(axis=0)
+        return int(np.count_nonzero(inside & unseen & ~silhouettes[0].overlaps(low, high)))
+
+    assert count_empty(carve(views, {}, box, size)) > 1000
+    assert count_empty(carve(views, silhouettes, box, size)) == 0
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_cells_are_as_small_as_their_number_allows(factor: int) -> None:
+    views = views_of(rods())
+    silhouettes, box = find_silhouettes(views), find_box(views, 2, 6)
+    size = 1.6 * box.pixel_footprint
+    expected = carve(views, silhouettes, box, factor * size)
+    assert expected is not None
+    found = carve(views, silhouettes, box, size, max_cells=int(expected.cells.sum()))
+    assert found is not None
+    assert found.cell_size == pytest.approx(factor * size)
+    np.testing.assert_array_equal(found.cells, expected.cells)
+    np.testing.assert_allclose(found.aabb_min, expected.aabb_min)
+
+
 def test_what_an_image_cuts_off_is_kept() -> None:
     """A long rod leaves every image: the views know nothing of what lies outside."""
     points = np.linspace(-1, 1, 8000)[:, None] * (0, 0, 1.9)

@@ -28,7 +28,7 @@ from edge_se_sampler.data.views import Views
 MARGIN = 2
 """Pixels by which a silhouette may be too small, or moved."""
 MIN_EMPTY_VIEWS = 2
-"""Views that must show a cell to be empty, if as many see it."""
+"""Views that must show a cell to be empty, if another may see something in it."""
 INITIAL_RESOLUTION = 16
 """Cells along the box when carving begins."""
 MIN_CANDIDATES = 0.8
@@ -187,7 +187,9 @@ def _is_seen(views: Views, centers: np.ndarray, cell_size: float) -> np.ndarray:
     for i, image in enumerate(views.images):
         low, high, side = project_cells(views.cameras, i, centers[unseen], cell_size)
         unseen = unseen[~_in_view(low, high, side, *image.shape[1::-1])]
-    return ~np.isin(np.arange(len(centers)), unseen, assume_unique=True)
+    seen = np.ones(len(centers), dtype=bool)
+    seen[unseen] = False
+    return seen
 
 
 def project_cells(
