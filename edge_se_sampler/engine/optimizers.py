@@ -73,8 +73,8 @@ def torch_groups(groups: Sequence[ParameterGroup], learning_rate: float, rays: i
     ]
 
 
-def build_adam(groups: list[dict[str, Any]], config: Any) -> RowAdam:
-    """Adam over torch's groups, by an `OptimizerConfig` or what has the same fields."""
+def build_adam(groups: list[dict[str, Any]], config: OptimizerConfig) -> RowAdam:
+    """Adam over `torch_groups`."""
     betas = (0.9, config.beta2)
     if config.fused:
         with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
@@ -82,10 +82,7 @@ def build_adam(groups: list[dict[str, Any]], config: Any) -> RowAdam:
     return RowAdam(groups, betas=betas, eps=config.eps)
 
 
-def learning_rate_factor(config: Any, progress: float, step: int) -> float:
-    """Learning rate of a step as a share of the initial one, by an `OptimizerConfig` or what has the same fields.
-
-    Args:
-        progress: part of the training, in [0, 1], that is done when the step begins.
-    """
+def learning_rate_factor(config: OptimizerConfig, progress: float, step: int) -> float:
+    """Learning rate of a step as a share of the initial one; `progress` is the part of the training, in [0, 1], that is
+    done when it begins."""
     return config.final_fraction**progress * min(1.0, (step + 1) / (config.warmup_steps + 1))
