@@ -41,8 +41,8 @@ def draw(folder: Path, workplace: Path | None) -> None:
 
 
 def describe(folder: Path) -> str:
-    """The README.md of a folder with a result.json; notes.md has remarks by hand, which no number shows."""
-    (result, baselines), notes = _read(folder), folder / "notes.md"
+    """The README.md of a folder with a result.json."""
+    result, baselines = _read(folder)
     runs = [run for run in result["runs"] if run["variant"] == BASELINE]
     return fill_template(
         __file__,
@@ -50,7 +50,6 @@ def describe(folder: Path) -> str:
         psnr=_table_of_psnr(runs),
         baselines=_table_of_baselines(result["runs"], baselines),
         published=_table_of_published(),
-        notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
         gaps=_table_of(runs, {"test": "psnr", "SSIM": "ssim", "validation": "val_psnr", "training": "train_psnr"}),
         costs=_table_of_costs(runs),
         variants=_table_of_variants(result["runs"]),
