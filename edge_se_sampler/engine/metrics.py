@@ -69,14 +69,15 @@ def compute_metrics(
     def mean_error(pixels: np.ndarray | None) -> float | None:
         return None if pixels is None or not (pixels & known).any() else float(error[pixels & known].mean())
 
-    def psnr_of(pixels: np.ndarray | None) -> float | None:
-        return None if (mse := mean_error(pixels)) is None else psnr(mse)
+    def psnr_of(mse: float | None) -> float | None:
+        return None if mse is None else psnr(mse)
 
+    mse = mean_error(known)
     return {
-        "mse": mean_error(known),
-        "psnr": psnr_of(known),
+        "mse": mse,
+        "psnr": psnr_of(mse),
         "ssim": ssim(rendered, target, mask),
-        "foreground_psnr": psnr_of(foreground),
-        "edge_band_psnr": psnr_of(edge_band(target)),
+        "foreground_psnr": psnr_of(mean_error(foreground)),
+        "edge_band_psnr": psnr_of(mean_error(edge_band(target))),
         "background_mse": None if foreground is None else mean_error(~foreground),
     }
