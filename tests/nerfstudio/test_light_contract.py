@@ -416,7 +416,7 @@ def test_training_is_the_same_with_our_sampler_on_either_base(scene: Path) -> No
 
 # -- how nerfstudio finds us ------------------------------------------------------------------------------------------
 
-ENTRY_POINTS = sorted({name for name in STRATEGIES if name != "vanilla-nerf"} | {"edge-se-nerfacto"})
+ENTRY_POINTS = sorted({name for name in STRATEGIES if name != "vanilla-nerf"} | {"edge-se-nerfacto", "lean-nerf"})
 
 
 def test_entry_points_that_cannot_be_had_break_nothing() -> None:
