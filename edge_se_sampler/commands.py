@@ -12,6 +12,7 @@ import tyro
 from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import check_value
+from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
@@ -160,6 +161,22 @@ class Render(_RunCommand):
         print(self.output_path)
 
 
+@dataclass(frozen=True)
+class Export(_RunCommand):
+    """Take a run to other programs: edge-se export RUN mesh|points|cameras|splats."""
+
+    what: Annotated[
+        Annotated[ExportMesh, tyro.conf.subcommand("mesh")]
+        | Annotated[ExportPoints, tyro.conf.subcommand("points")]
+        | Annotated[ExportCameras, tyro.conf.subcommand("cameras")]
+        | Annotated[ExportSplats, tyro.conf.subcommand("splats")],
+        tyro.conf.arg(name=""),
+    ]
+
+    def run(self) -> None:
+        print(self.what.export(*self._load()))
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Data:
     data: Path
@@ -262,7 +279,7 @@ class Bench:
     """Run the experiments and timings behind the published numbers."""
 
 
-_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Show, Inspect, Methods, Bench)
+_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, Show, Inspect, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
 
 

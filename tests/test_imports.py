@@ -22,7 +22,7 @@ LAYERS = [
     ("models",),
     ("engine",),
     ("methods",),
-    ("nerfstudio", "bench"),
+    ("nerfstudio", "bench", "export"),
     ("commands",),
     ("cli",),
 ]
