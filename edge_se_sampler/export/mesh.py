@@ -14,13 +14,11 @@ from edge_se_sampler.engine.files import to_uint8, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import load_model, read_train_views
+from edge_se_sampler.engine.session import load_model
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.export.density import lean_density, nerf_density
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.export.surface import find_surface, keep_largest
 from edge_se_sampler.models.lean import LeanModel
-from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import RayModel
 
 RAYS_AT_ONCE = 2**16
@@ -37,13 +35,11 @@ def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: floa
     import trimesh
 
     model, _ = load_model(run, config)
-    if isinstance(model, LeanModel):
-        density = lean_density(model)
-    elif isinstance(model, NeRFModel):
-        density = nerf_density(model, read_train_views(config))
-    else:
-        raise InputError(f"{config.method_name} has no density that a mesh could be made of")
-    vertices, triangles = find_surface(density, -np.log1p(-opacity))
+    if not isinstance(model, LeanModel):
+        raise InputError(
+            f"{config.method_name} has no cells to make a mesh of; lean-nerf has, and export points needs none"
+        )
+    vertices, triangles = find_surface(model, opacity)
     if not len(triangles):
         raise InputError(
             f"--opacity-threshold is {opacity}: nothing is as opaque; give a lower one, or train for longer"
@@ -51,7 +47,7 @@ def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: floa
     vertices, triangles = keep_largest(vertices, triangles, keep_components)
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     normals = np.array(mesh.vertex_normals)
-    cell_size = float(density.grid.cell_size)
+    cell_size = float(model.grid.cell_size)
     colors = ask_colors(model, vertices, normals, CELLS_BEFORE * cell_size)
     if path.suffix.lower() == ".glb":
         write_atomically(path, to_glb(vertices, normals, colors, triangles))

@@ -94,8 +94,8 @@ def find_points(model: RayModel, views: Views, num_points: int, rng: np.random.G
 
 
 def find_normals(positions: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (n, 3) of the planes through points and their neighbors, against the directions (n, 3) from which they
-    are seen, and the mean distances (n,) to the three nearest."""
+    """Normals (n, 3) of the planes through points and their neighbors, against the mean of the directions (n, 3) in
+    which these are seen, and the mean distances (n,) to the three nearest."""
     from scipy.spatial import cKDTree
 
     distance, number = cKDTree(positions).query(positions, NEIGHBORS + 1)
@@ -103,6 +103,7 @@ def find_normals(positions: np.ndarray, directions: np.ndarray) -> tuple[np.ndar
     for some in np.array_split(np.arange(len(positions)), len(positions) // 2**15 + 1):
         around = positions[number[some]]
         around = around - around.mean(axis=1, keepdims=True)
-        normals[some] = np.linalg.eigh(around.swapaxes(1, 2) @ around)[1][:, :, 0]
-    normals[(normals * directions).sum(axis=1) > 0] *= -1
+        normal = np.linalg.eigh(around.swapaxes(1, 2) @ around)[1][:, :, 0]
+        away = (normal * directions[number[some]].mean(axis=1)).sum(axis=1, keepdims=True) > 0
+        normals[some] = np.where(away, -normal, normal)
     return normals, distance[:, 1:4].mean(axis=1)

@@ -31,7 +31,7 @@ def splat_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
     """The properties of Gaussians: color as a spherical harmonic, opacity before the sigmoid, logarithms of standard
     deviations, and the rotation (w, x, y, z) that turns z to the normal."""
     opacity = np.minimum(cloud.opacity, MAX_OPACITY)
-    spacing = np.log(cloud.spacing.clip(1e-9 * cloud.spacing.max()))
+    spacing = np.log(cloud.spacing)
     up = np.where(cloud.normals[:, 2:] < 0, -1, 1) * cloud.normals  # a flat Gaussian is the same upside down
     rotation = np.stack((1 + up[:, 2], -up[:, 1], up[:, 0], np.zeros(len(up))), axis=1)
     rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
