@@ -67,7 +67,7 @@ def test_where_no_cell_is_occupied_the_surface_closes() -> None:
     box = mesh_of(*find_surface(model, OPACITY))
     assert box.is_watertight
     sizes = np.array([40, 39, 38]) * CELL
-    np.testing.assert_allclose(box.bounds, [[-1] * 3, sizes - 1], atol=0.5 * CELL)
+    np.testing.assert_allclose(box.bounds, np.stack((np.full(3, -1.0), sizes - 1)), atol=0.5 * CELL)
     assert box.volume >= sizes.prod()
 
 

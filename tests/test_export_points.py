@@ -18,7 +18,7 @@ from edge_se_sampler.export.points import PointCloud, find_points
 pytest.importorskip("scipy")
 VIEWS = ball_views(6, 48, RADIUS)
 SEEN_RADIUS = RADIUS - CELL * np.log(2 * np.log(2) / -np.log(1 - OPACITY)) / 2
-"""At which half of the light is lost on the way to the center: the logarithm of density rises by 2 from cell to cell."""
+"""At which half of the light is lost on the way to the center: density's logarithm rises by 2 from cell to cell."""
 GAUSSIAN = [
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45)),
     "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
@@ -38,7 +38,8 @@ def test_points_lie_on_the_surface_and_face_outwards_in_its_colors() -> None:
     cloud = points_of()
     assert len(cloud.positions) == 1500
     radius = np.linalg.norm(cloud.positions, axis=1)
-    assert np.abs(radius - SEEN_RADIUS).max() < 1.2 * CELL  # further out at its edge, where rays graze it
+    assert radius.min() > SEEN_RADIUS - 0.3 * CELL
+    assert radius.max() < RADIUS  # at its edge, where rays graze it
     assert abs(np.median(radius) - SEEN_RADIUS) < 0.3 * CELL
     cosine = (cloud.normals * cloud.positions).sum(axis=1) / radius
     assert np.quantile(cosine, 0.01) > 0.9
@@ -98,7 +99,8 @@ def test_points_are_read_back(scale: float, tmp_path: Path, edge_se: Callable) -
     columns = read_ply(path)
     assert list(columns) == ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]  # 3DGS's order, and OpenSplat's
     positions = stacked(columns, "x", "y", "z")
-    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), SEEN_RADIUS * scale, atol=1.2 * CELL * scale)
+    radius = np.linalg.norm(positions, axis=1) / scale
+    assert SEEN_RADIUS - 0.3 * CELL < radius.min() < radius.max() < RADIUS
     colors = stacked(columns, "red", "green", "blue") / 255
     np.testing.assert_allclose(colors, color_at(positions / scale), atol=0.02)
     loaded = pytest.importorskip("trimesh").load(path, process=False)

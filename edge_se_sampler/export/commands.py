@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edge_se_sampler.engine.config import TrainerConfig
+    from edge_se_sampler.engine.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -19,10 +23,10 @@ class ExportMesh:
     keep_components: int = 1
     """How many of the surface's connected parts are kept, the largest first; 0: all."""
 
-    def export(self, *run: Any) -> str:
+    def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.mesh import export_mesh
 
-        return export_mesh(*run, self.output_path, self.opacity_threshold, self.keep_components)
+        return export_mesh(run, config, self)
 
 
 @dataclass(frozen=True)
@@ -36,10 +40,10 @@ class ExportPoints:
     seed: int = 0
     """Seed of the pixels that are chosen."""
 
-    def export(self, *run: Any) -> str:
+    def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.points import export_points
 
-        return export_points(*run, self.output_path, self.num_points, self.seed)
+        return export_points(run, config, self)
 
 
 @dataclass(frozen=True)
@@ -49,10 +53,10 @@ class ExportSplats(ExportPoints):
     output_path: Path = Path("splats.ply")
     """The .ply to write."""
 
-    def export(self, *run: Any) -> str:
+    def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.splats import export_splats
 
-        return export_splats(*run, self.output_path, self.num_points, self.seed)
+        return export_splats(run, config, self)
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ class ExportCameras:
     output_path: Path = Path("transforms.json")
     """The json to write; files are named relative to its folder."""
 
-    def export(self, _: Any, config: Any) -> str:
+    def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.cameras import export_cameras
 
         return export_cameras(config, self.output_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model
 from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.export.commands import ExportMesh
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.export.surface import find_surface, keep_largest
 from edge_se_sampler.models.lean import LeanModel
@@ -26,49 +26,43 @@ CELLS_BEFORE = 2
 """How far outside the surface the rays begin that ask for its colors, in cells."""
 
 
-def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: float, keep_components: int) -> str:
-    """Write the surface at which a cell has that opacity across; returns a line about it. InputError if a value is out
-    of its range, the file cannot be written, or nothing is as opaque."""
+def export_mesh(run: RunFolder, config: TrainerConfig, flags: ExportMesh) -> str:
+    """Write a run's surface, by the command's flags; returns a line about it. InputError if a flag has no meaning, the
+    file cannot be written, or nothing is as opaque."""
+    path, opacity = flags.output_path, flags.opacity_threshold
     check_value("opacity-threshold", opacity, 0 < opacity < 1, "above 0 and below 1")
-    check_value("keep-components", keep_components, keep_components >= 0, "at least 0")
+    check_value("keep-components", flags.keep_components, flags.keep_components >= 0, "at least 0")
     check_export(path, ".ply", ".glb")
     import trimesh
 
     model, _ = load_model(run, config)
     if not isinstance(model, LeanModel):
         raise InputError(
-            f"{config.method_name} has no cells to make a mesh of; lean-nerf has, and export points needs none"
+            f"{config.method_name} has no cells to make a mesh of; lean-nerf has, export points needs none"
         )
     vertices, triangles = find_surface(model, opacity)
     if not len(triangles):
-        raise InputError(
-            f"--opacity-threshold is {opacity}: nothing is as opaque; give a lower one, or train for longer"
-        )
-    vertices, triangles = keep_largest(vertices, triangles, keep_components)
+        raise InputError(f"--opacity-threshold is {opacity}: nothing is as opaque; give less, or train for longer")
+    vertices, triangles = keep_largest(vertices, triangles, flags.keep_components)
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     normals = np.array(mesh.vertex_normals)
-    cell_size = float(model.grid.cell_size)
-    colors = ask_colors(model, vertices, normals, CELLS_BEFORE * cell_size)
+    colors = ask_colors(model, vertices, normals, CELLS_BEFORE * float(model.grid.cell_size))
     if path.suffix.lower() == ".glb":
         write_atomically(path, to_glb(vertices, normals, colors, triangles))
     else:
         write_ply(path, point_columns(vertices, normals) | color_columns(to_uint8(colors)), triangles)
     closed = "watertight" if mesh.is_watertight else "not watertight"
-    contents = f"{len(vertices):,} vertices, {len(triangles):,} faces, cells of {cell_size:.4g}, {closed}"
-    return describe_file(path, contents)
+    return describe_file(path, f"{len(vertices):,} vertices, {len(triangles):,} faces, {closed}")
 
 
 def ask_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:
-    """Colors (n, 3) in [0, 1] of a surface: those of rays along the inward normals, which begin that far outside.
-
-    A ray's color is what training has learned to be right; the color network's own answer at a point is a mean over
-    nothing, and where the weights of rays are small nobody has trained it."""
+    """Colors (n, 3) in [0, 1] of a surface: those of rays along its inward normals, which begin that far outside. For
+    training fits the colors of rays: at the surface itself, where these have little weight yet, the network's color may
+    be any."""
     origins = torch.from_numpy(positions + normals * (before + model.config.depths[0]))
-    directions = torch.from_numpy(-normals)
-    one, number = torch.ones(len(origins), 1), torch.zeros((len(origins), 1), dtype=torch.int64)
-    metadata = {"directions_norm": one, "pixel_axes": torch.zeros(len(origins), 2, 3)}
-    values = (value.to(model.device, model.dtype) for value in (origins, directions))
-    rays = RayBundle(*values, number.to(model.device), {key: x.to(model.device) for key, x in metadata.items()})
+    origins, directions = (x.to(model.device, model.dtype) for x in (origins, torch.from_numpy(-normals)))
+    metadata = {"directions_norm": torch.ones_like(origins[:, :1]), "pixel_axes": origins.new_zeros(len(origins), 2, 3)}
+    rays = RayBundle(origins, directions, torch.zeros_like(origins[:, :1], dtype=torch.int64), metadata)
     colors = []
     with Progress(len(rays), "asking for colors") as progress:
         for start in range(0, len(rays), RAYS_AT_ONCE):
@@ -88,9 +82,11 @@ def render_opaque(model: RayModel, rays: RayBundle) -> tuple[torch.Tensor, torch
 
 
 def to_glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> bytes:
-    """A mesh as binary glTF 2.0, whose y is up and whose vertex colors are linear: data's x, y, z become x, -z, y, and
-    sRGB colors (n, 3) in [0, 1] are linearized. It is shown unlit, for its colors have the scene's light in them."""
-    import trimesh
+    """A mesh as binary glTF 2.0, whose y is up and whose vertex colors are linear: its y is the data's z, its z minus
+    the data's y, and sRGB colors (n, 3) in [0, 1] are linearized, as floats: bytes are too coarse for dark ones. It is
+    shown unlit, for the scene's light is in its colors."""
+    from trimesh import Trimesh
+    from trimesh.exchange.gltf import export_glb
 
     linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
@@ -104,11 +100,11 @@ def to_glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, triang
         tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}]
         tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
-    mesh = trimesh.Trimesh(
+    mesh = Trimesh(
         turn(vertices),
         triangles,
         vertex_normals=turn(normals),
-        vertex_attributes={"color": linear.astype(np.float32)},
+        vertex_attributes={"_color": linear.astype(np.float32)},
         process=False,
     )
-    return trimesh.exchange.gltf.export_glb(mesh, include_normals=True, tree_postprocessor=add_colors)
+    return export_glb(mesh, include_normals=True, tree_postprocessor=add_colors)
