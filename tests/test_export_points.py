@@ -156,7 +156,7 @@ def test_splats_are_flat_gaussians_on_the_surface(tmp_path: Path, edge_se: Calla
     scales = np.exp(stacked(splats, "scale_0", "scale_1", "scale_2"))
     positions = stacked(splats, "x", "y", "z")
     between = np.sort(np.linalg.norm(positions[:, None] - positions, axis=2), axis=1)
-    np.testing.assert_allclose(scales[:, :2], between[:, 1:4].mean(axis=1, keepdims=True).repeat(2, 1), rtol=1e-4)
+    np.testing.assert_allclose(scales[:, :2], between[:, 1:4].mean(axis=1, keepdims=True).repeat(2, 1) / 2, rtol=1e-4)
     assert (scales[:, 2] < 0.2 * scales[:, 0]).all()
     w, x, y, z = stacked(splats, "rot_0", "rot_1", "rot_2", "rot_3").T  # a unit quaternion's third column
     axis = np.stack((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)), axis=1)
