@@ -78,6 +78,17 @@ def test_a_blender_scene_becomes_one_file(tmp_path: Path) -> None:
         assert_same(read(tmp_path, split, data_format="transforms"), expected)
 
 
+@pytest.mark.parametrize("held_out", ["val", "test"])
+def test_the_one_list_of_held_out_views_is_both(held_out: str, tmp_path: Path) -> None:
+    """nerfstudio measures on val while it trains and on test afterwards, and stops where a list is missing."""
+    for split in ("train", held_out):
+        write_scene(tmp_path, 2, split)
+    export_cameras(config_of(tmp_path, "blender"), tmp_path / "transforms.json")
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    expected = [f"{held_out}/r_0.png", f"{held_out}/r_1.png"]
+    assert document["val_filenames"] == document["test_filenames"] == expected
+
+
 def test_cameras_that_differ_are_with_their_frames_and_masks_too(tmp_path: Path) -> None:
     document = write_transforms(tmp_path)
     for i, frame in enumerate(document["frames"]):

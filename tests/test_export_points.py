@@ -15,7 +15,8 @@ from tiny import ball_views
 
 from edge_se_sampler.export.points import PointCloud, find_points
 
-pytest.importorskip("scipy")
+for package in ("scipy", "skimage", "trimesh"):
+    pytest.importorskip(package)
 VIEWS = ball_views(6, 48, RADIUS)
 SEEN_RADIUS = RADIUS - CELL * np.log(2 * np.log(2) / -np.log(1 - OPACITY)) / 2
 """At which half of the light is lost on the way to the center: density's logarithm rises by 2 from cell to cell."""

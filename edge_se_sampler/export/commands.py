@@ -26,7 +26,7 @@ class ExportMesh:
     def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.mesh import export_mesh
 
-        return export_mesh(run, config, self)
+        return export_mesh(run, config, self.output_path, self.opacity_threshold, self.keep_components)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ExportPoints:
     def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.points import export_points
 
-        return export_points(run, config, self)
+        return export_points(run, config, self.output_path, self.num_points, self.seed)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ExportSplats(ExportPoints):
     def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.splats import export_splats
 
-        return export_splats(run, config, self)
+        return export_splats(run, config, self.output_path, self.num_points, self.seed)
 
 
 @dataclass(frozen=True)

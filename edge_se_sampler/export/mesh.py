@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.export.commands import ExportMesh
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.export.surface import find_surface, keep_largest
 from edge_se_sampler.models.lean import LeanModel
@@ -26,12 +26,11 @@ CELLS_BEFORE = 2
 """How far outside the surface the rays begin that ask for its colors, in cells."""
 
 
-def export_mesh(run: RunFolder, config: TrainerConfig, flags: ExportMesh) -> str:
-    """Write a run's surface, by the command's flags; returns a line about it. InputError if a flag has no meaning, the
-    file cannot be written, or nothing is as opaque."""
-    path, opacity = flags.output_path, flags.opacity_threshold
+def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: float, keep_components: int) -> str:
+    """Write the surface at which a cell has that opacity across; returns a line about it. InputError if a value is out
+    of its range, the file cannot be written, or nothing is as opaque."""
     check_value("opacity-threshold", opacity, 0 < opacity < 1, "above 0 and below 1")
-    check_value("keep-components", flags.keep_components, flags.keep_components >= 0, "at least 0")
+    check_value("keep-components", keep_components, keep_components >= 0, "at least 0")
     check_export(path, ".ply", ".glb")
     import trimesh
 
@@ -43,7 +42,7 @@ def export_mesh(run: RunFolder, config: TrainerConfig, flags: ExportMesh) -> str
     vertices, triangles = find_surface(model, opacity)
     if not len(triangles):
         raise InputError(f"--opacity-threshold is {opacity}: nothing is as opaque; give less, or train for longer")
-    vertices, triangles = keep_largest(vertices, triangles, flags.keep_components)
+    vertices, triangles = keep_largest(vertices, triangles, keep_components)
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     normals = np.array(mesh.vertex_normals)
     colors = ask_colors(model, vertices, normals, CELLS_BEFORE * float(model.grid.cell_size))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +15,6 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_train_views
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.export.commands import ExportPoints
 from edge_se_sampler.export.mesh import render_opaque
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.models.ray_model import RayModel
@@ -41,20 +41,20 @@ class PointCloud:
     """(n,) mean distance to the three nearest other points, world units."""
 
 
-def export_points(run: RunFolder, config: TrainerConfig, flags: ExportPoints) -> str:
-    """Write a run's points, by the command's flags; returns a line about them. InputError as `load_points`."""
-    cloud = load_points(run, config, flags)
-    write_ply(flags.output_path, point_columns(cloud.positions, cloud.normals) | color_columns(to_uint8(cloud.colors)))
-    return describe_file(flags.output_path, f"{len(cloud.positions):,} points")
+def export_points(run: RunFolder, config: TrainerConfig, path: Path, num_points: int, seed: int) -> str:
+    """Write a run's points; returns a line about them. InputError as `load_points`."""
+    cloud = load_points(run, config, path, num_points, seed)
+    write_ply(path, point_columns(cloud.positions, cloud.normals) | color_columns(to_uint8(cloud.colors)))
+    return describe_file(path, f"{len(cloud.positions):,} points")
 
 
-def load_points(run: RunFolder, config: TrainerConfig, flags: ExportPoints) -> PointCloud:
-    """A run's points, by a command's flags; InputError if one has no meaning, the file cannot be written, or nothing is
-    opaque."""
-    check_value("num-points", flags.num_points, flags.num_points > NEIGHBORS, f"above {NEIGHBORS}")
-    check_export(flags.output_path, ".ply")
+def load_points(run: RunFolder, config: TrainerConfig, path: Path, num_points: int, seed: int) -> PointCloud:
+    """A run's points, which are to be written as .ply; InputError if there can be no such number, the file cannot be
+    written, or nothing is opaque."""
+    check_value("num-points", num_points, num_points > NEIGHBORS, f"above {NEIGHBORS}")
+    check_export(path, ".ply")
     model, _ = load_model(run, config)
-    return find_points(model, read_train_views(config), flags.num_points, np.random.default_rng(flags.seed))
+    return find_points(model, read_train_views(config), num_points, np.random.default_rng(seed))
 
 
 def find_points(model: RayModel, views: Views, num_points: int, rng: np.random.Generator) -> PointCloud:

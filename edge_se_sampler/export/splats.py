@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.export.commands import ExportSplats
 from edge_se_sampler.export.ply import describe_file, point_columns, write_ply
 from edge_se_sampler.export.points import PointCloud, load_points
 
@@ -21,12 +22,11 @@ FLATNESS = 0.1
 MAX_OPACITY = 0.99
 
 
-def export_splats(run: RunFolder, config: TrainerConfig, flags: ExportSplats) -> str:
-    """Write a Gaussian for each of a run's points, by the command's flags; returns a line about them. InputError as
-    `load_points`."""
-    cloud = load_points(run, config, flags)
-    write_ply(flags.output_path, splat_columns(cloud))
-    return describe_file(flags.output_path, f"{len(cloud.positions):,} Gaussians")
+def export_splats(run: RunFolder, config: TrainerConfig, path: Path, num_points: int, seed: int) -> str:
+    """Write a Gaussian for each of a run's points; returns a line about them. InputError as `load_points`."""
+    cloud = load_points(run, config, path, num_points, seed)
+    write_ply(path, splat_columns(cloud))
+    return describe_file(path, f"{len(cloud.positions):,} Gaussians")
 
 
 def splat_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
