@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Demo:
-    """Train Random and Edge + SE on an off-center, mostly white scene, and compare them: a few minutes."""
+    """Train Random, Edge + SE and lean-nerf on an off-center, mostly white scene, and compare them: three minutes."""
 
     output_dir: Path = Path()
-    """Folder for demo.png, demo.json and demo/ (the scene and the runs)."""
+    """Folder for demo.html, demo.png, demo.gif, demo.json and demo/ (the scene and the runs)."""
     seed: int = 0
-    """Seed of weights, pixels and jitter; both methods start from the same weights."""
+    """Seed of weights, pixels and jitter; Random and Edge + SE start from the same weights."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.demo import METHODS, run_demo
@@ -36,7 +36,7 @@ class Demo:
         for method, measured in run_demo(self.output_dir, self.seed)["methods"].items():
             psnr, seconds = measured["results"]["psnr"], measured["training_seconds"]
             print(f"{METHODS[method]:>9}: {psnr:.2f} dB in {seconds:.0f} s of training")
-        print(f"see {self.output_dir / 'demo.png'} and {self.output_dir / 'demo.json'}")
+        print(f"see {self.output_dir / 'demo.html'} (in a browser), demo.png, demo.gif and demo.json")
 
 
 @dataclass(frozen=True)

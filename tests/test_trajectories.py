@@ -89,11 +89,14 @@ def test_views_on_one_side_are_not_left(moved: bool) -> None:
     assert steps.max() < 0.3  # it closes
 
 
-def test_the_arc_may_lie_where_angles_jump() -> None:
-    """From 140 over 180 to -140 degrees."""
-    turned = views_of(looking_at_origin(np.linspace(140, 220, 50), np.full(50, 30)))
-    positions = spiral(turned, (2.0, 6.0), 60).camera_to_worlds[:, :, 3].numpy()
-    assert positions[:, 0].max() < -2.5
+@pytest.mark.parametrize("width", [80, 210])
+@pytest.mark.parametrize("middle", range(0, 360, 45))
+def test_the_arc_may_lie_where_angles_jump(middle: float, width: float) -> None:
+    arc = looking_at_origin(middle + np.linspace(-width / 2, width / 2, 50), np.full(50, 30))
+    positions = spiral(views_of(arc), (2.0, 6.0), 60).camera_to_worlds[:, :, 3].numpy()
+    azimuth = np.degrees(np.arctan2(positions[:, 1], positions[:, 0]))
+    off = (azimuth - middle + 180) % 360 - 180
+    assert (off.min(), off.max()) == pytest.approx((-width / 4, width / 4), abs=2)
 
 
 def test_up_is_vertical_though_views_on_one_side_look_down() -> None:
@@ -121,6 +124,13 @@ def test_interpolation_passes_through_every_pose_in_order_without_a_kink(moved: 
     np.testing.assert_allclose(
         rotation.transpose(0, 2, 1) @ rotation, np.broadcast_to(np.eye(3), rotation.shape), atol=1e-9
     )
+
+
+def test_interpolation_turns_evenly_through_any_number_of_turns() -> None:
+    views = views_of(looking_at_origin(np.linspace(0, 1440, 60), np.full(60, 30)))
+    rotations = through(views, (2.0, 6.0), 600).camera_to_worlds[:, :, :3].numpy()
+    steps = np.linalg.norm(np.diff(rotations, axis=0), axis=(1, 2))
+    assert steps.max() < 1.3 * np.median(steps)
 
 
 def test_interpolation_goes_around_what_is_looked_at() -> None:
