@@ -134,7 +134,7 @@ def _turntable(trainer: Trainer) -> Iterator[np.ndarray]:
 
 def _captions(result: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     """A title and a line below it for the truth and each method."""
-    found = {"truth": ("Ground truth", f"a test view, {SCENE['size']} x {SCENE['size']} pixels")}
+    found = {"truth": ("Ground truth", f"a test view, {SCENE['size']} x {SCENE['size']} px")}
     for method, measured in result["methods"].items():
         seconds, decibel = measured["training_seconds"], measured["results"]["psnr"]
         found[method] = (METHODS[method], f"{decibel:.2f} dB, {seconds:.0f} s of training")
