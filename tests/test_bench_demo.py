@@ -24,6 +24,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "ITERATIONS", 20)
     monkeypatch.setattr(demo, "TIME_BUDGET", "1")
     monkeypatch.setattr(demo, "TURN", 3)
+    monkeypatch.setattr(demo, "compiled_ops", lambda: None)
 
 
 @pytest.mark.usefixtures("short")
@@ -53,6 +54,9 @@ def test_the_demo_prints_its_result_and_leaves_pictures_a_page_and_a_json(tmp_pa
     assert methods["lean-nerf"]["results"]["psnr"] > result["background_psnr"] + 1
     assert iio.imread(tmp_path / "seed-3" / "demo.gif", index=None).shape == (3, 240, 240, 3)
     _check_self_contained(page, (tmp_path / "seed-3" / "demo.gif").read_bytes())
+    pictures, box = {name: np.ones((8, 8, 3)) for name in ("truth", *methods)}, (slice(4), slice(4))
+    with_numba = demo._page(tmp_path / "seed-3" / "demo.gif", result | {"numba": True}, pictures, box)
+    assert ["numba is not installed" in text for text in (page, with_numba)] == [True, False]
 
 
 def _check_self_contained(page: str, gif: bytes) -> None:
@@ -66,15 +70,6 @@ def _check_self_contained(page: str, gif: bytes) -> None:
     assert [image.shape for image in whole] == [(24, 24, 3)] * 4
     assert len({image.tobytes() for image in whole}) == 4  # of four
     assert not re.search(r"\$\w|url\(|@import", page)
-
-
-@pytest.mark.usefixtures("short")
-def test_without_numba_the_page_says_so(tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("bench.demo", "models.voxel_backend", "models.lean"):
-        monkeypatch.setattr(f"edge_se_sampler.{module}.compiled_ops", lambda: None)
-    assert edge_se("demo", "--output-dir", tmp_path).code == 0
-    assert not json.loads((tmp_path / "demo.json").read_text())["numba"]
-    assert "numba is not installed" in (tmp_path / "demo.html").read_text()
 
 
 def test_the_enlarged_part_is_a_square_around_the_object() -> None:

@@ -38,6 +38,7 @@ ITERATIONS = 400
 TIME_BUDGET = "20"  # seconds, of lean-nerf
 METHODS = {"vanilla-nerf": "Random", "edge-se-nerf": "Edge + SE", "lean-nerf": "lean-nerf"}
 TURN = 48  # frames
+PIXELS = {"uniform": "uniform", "edge": "by edge strength", "se": "by squared error"}
 
 
 def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
@@ -91,8 +92,11 @@ def _train(trainer: Trainer) -> tuple[dict[str, Any], np.ndarray]:
     pictures = to_pictures(read_test_views(trainer.config))
     results = evaluate(trainer.pipeline.model, pictures, lambda _, __, rendered: views.append(rendered))
     described = dict(line.split(maxsplit=1) for line in describe_run(trainer).splitlines())
+    sampler: Any = trainer.pipeline.datamanager.config.pixel_sampler
+    early, late = PIXELS[sampler.early], PIXELS[sampler.late]
     measured = {
-        **{name: described[name] for name in ("model", "pixels")},
+        "model": described["model"],
+        "pixels": late if early == late else f"{early} for {sampler.early_fraction:.0%} of the training, then {late}",
         "steps": trainer.next_step,
         "rays_per_step": trainer.config.preset.rays,
         "training_seconds": round(trainer.setup_seconds + trainer.elapsed, 1),
