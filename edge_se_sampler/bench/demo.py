@@ -34,7 +34,7 @@ from edge_se_sampler.models.voxel_backend import compiled_ops
 
 SCENE: dict[str, Any] = {"name": "mic", "placement": "shifted", "offset": (0.2, 0.15), "size": 200}
 SPLITS: dict[str, Any] = {"num_train": 50, "num_val": 1, "num_test": 4}
-ITERATIONS = 400
+ITERATIONS = 320
 TIME_BUDGET = "20"  # seconds, of lean-nerf
 METHODS = {"vanilla-nerf": "Random", "edge-se-nerf": "Edge + SE", "lean-nerf": "lean-nerf"}
 TURN = 48  # frames
