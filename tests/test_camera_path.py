@@ -127,6 +127,6 @@ def test_nerfstudio_means_the_same_cameras(tmp_path: Path) -> None:
     paths = pytest.importorskip("nerfstudio.cameras.camera_paths")
     theirs = paths.get_path_from_json(path_json())
     ours = read_camera_path(write(tmp_path, path_json())).cameras
-    torch.testing.assert_close(theirs.camera_to_worlds, ours.camera_to_worlds.float())
+    torch.testing.assert_close(theirs.camera_to_worlds, ours.camera_to_worlds, check_dtype=False)
     for key in ("fx", "fy", "cx", "cy"):
-        torch.testing.assert_close(getattr(theirs, key), getattr(ours, key).float())
+        torch.testing.assert_close(getattr(theirs, key), getattr(ours, key), check_dtype=False)
