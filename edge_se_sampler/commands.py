@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Demo:
-    """Train Random and Edge + SE on an off-center, mostly white scene, and compare them: a few minutes."""
+    """Train Random, Edge + SE and lean-nerf on an off-center, mostly white scene, and compare them: three minutes."""
 
     output_dir: Path = Path()
-    """Folder for demo.png, demo.json and demo/ (the scene and the runs)."""
+    """Folder for demo.html, demo.png, demo.gif, demo.json and demo/ (the scene and the runs)."""
     seed: int = 0
-    """Seed of weights, pixels and jitter; both methods start from the same weights."""
+    """Seed of weights, pixels and jitter; Random and Edge + SE start from the same weights."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.demo import METHODS, run_demo
@@ -37,7 +37,7 @@ class Demo:
         for method, measured in run_demo(self.output_dir, self.seed)["methods"].items():
             psnr, seconds = measured["results"]["psnr"], measured["training_seconds"]
             print(f"{METHODS[method]:>9}: {psnr:.2f} dB in {seconds:.0f} s of training")
-        print(f"see {self.output_dir / 'demo.png'} and {self.output_dir / 'demo.json'}")
+        print(f"see {self.output_dir / 'demo.html'} (in a browser), demo.png, demo.gif and demo.json")
 
 
 @dataclass(frozen=True)
@@ -143,21 +143,31 @@ class Eval(_RunCommand):
 
 @dataclass(frozen=True)
 class Render(_RunCommand):
-    """Render a run as a video."""
+    """Render a run as a video, or as a folder of frames."""
 
     output_path: Path = Path("render.gif")
-    """The video to write, .gif or .mp4 (extra [video])."""
-    kind: Literal["spiral", "test"] = "spiral"
-    """Cameras on a spiral around the scene, or the held-out ones."""
+    """The video to write, .gif or .mp4 (extra [video]). Without an ending it is a folder: OUTPUT/00000.png and so on,
+    and frames.json, which says what they are; what was interrupted there goes on."""
+    outputs: tuple[Literal["rgb", "rgba", "accumulation", "depth", "raw-depth"], ...] = ("rgb",)
+    """What to show, side by side in a video: colors; in folders alone, colors with straight alpha; opacity; depth in
+    colors, near is red; in folders alone, depth along the optical axis as 16 bits, in the units that frames.json
+    says."""
+    kind: Literal["spiral", "interpolate", "train", "test"] | None = None
+    """Cameras: a turn around what the training views look at, or to and fro where they are on one side of it (spiral,
+    the default); a path through the training views in their order; the training views; the held-out ones."""
+    camera_path: Path | None = None
+    """Cameras of nerfstudio's viewer (camera_path.json) in place of a kind, in the units and axes of the run's data."""
     num_frames: int = 60
-    """Frames of the spiral."""
-    frames_per_second: int = 20
-    """Frame rate of the video."""
+    """Frames of spiral and interpolate."""
+    frames_per_second: float | None = None
+    """Frame rate of the video; by default the camera path's, or 20."""
+    depth_unit: float | None = None
+    """What 1 means in raw-depth, world units; by default the power of ten that lets 16 bits reach to the far depth."""
 
     def run(self) -> None:
         from edge_se_sampler.engine.video import render_run
 
-        render_run(*self._load(), self.output_path, self.kind, self.num_frames, self.frames_per_second)
+        render_run(*self._load(), **{key: value for key, value in vars(self).items() if key != "run_folder"})
         print(self.output_path)
 
 
