@@ -15,6 +15,7 @@ from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 
 if TYPE_CHECKING:
     from edge_se_sampler.data.views import Views
@@ -100,6 +101,29 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Training:
+    """What edge-se train METHOD takes."""
+
+    config: Annotated[TrainerConfig, tyro.conf.arg(name="")]
+    view: tyro.conf.UseCounterAction[int] = 0
+    """Fly through the model in the browser while it trains."""
+    viewer: ViewerConfig = ViewerConfig()
+
+    def run(self) -> None:
+        if self.view:
+            self.viewer.check()
+        from edge_se_sampler.engine.session import prepare
+
+        trainer = prepare(self.config)
+        if not self.view:
+            train(trainer)
+            return
+        from edge_se_sampler.viewer.server import view_training
+
+        view_training(trainer, self.viewer, train)
+
+
+@dataclass(frozen=True)
 class _RunCommand:
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
@@ -158,6 +182,26 @@ class Render(_RunCommand):
 
         render_run(*self._load(), self.output_path, self.kind, self.num_frames, self.frames_per_second)
         print(self.output_path)
+
+
+@dataclass(frozen=True)
+class View(ViewerConfig, _RunCommand):
+    """Fly through a run in the browser; another process may be training it."""
+
+    html: Path | None = None
+    """Write one html file that needs no server instead: points, cameras and a turntable."""
+
+    def run(self) -> None:
+        check_viser()
+        if self.html is None:
+            from edge_se_sampler.viewer.server import view_run
+
+            view_run(*self._load(), self)
+        else:
+            from edge_se_sampler.viewer.html import write_html
+
+            write_html(*self._load(), self.html)
+            print(self.html)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +306,7 @@ class Bench:
     """Run the experiments and timings behind the published numbers."""
 
 
-_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Show, Inspect, Methods, Bench)
+_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, View, Show, Inspect, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
 
 
