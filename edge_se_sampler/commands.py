@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -107,7 +107,7 @@ class Training:
     config: Annotated[TrainerConfig, tyro.conf.arg(name="")]
     view: tyro.conf.UseCounterAction[int] = 0
     """Fly through the model in the browser while it trains."""
-    viewer: ViewerConfig = ViewerConfig()
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
 
     def run(self) -> None:
         if self.view:

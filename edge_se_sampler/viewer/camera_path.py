@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
+import viser
 import viser.transforms as tf
 
 from edge_se_sampler.data.cameras import Cameras, rotation_power
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 """Between OpenCV's camera axes, which viser has (x right, y down, z forward), and OpenGL's."""
+FPS = 24
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class View:
     """Width over height."""
 
     @classmethod
-    def of(cls, camera: Any) -> View:
+    def of(cls, camera: viser.CameraHandle) -> View:
         """What viser's camera sees."""
         rotation = tf.SO3(camera.wxyz).as_matrix() @ FLIP
         return cls(np.column_stack((rotation, camera.position)), camera.fov, camera.aspect)
@@ -47,48 +49,32 @@ class View:
 
     def camera(self, height: int) -> Cameras:
         """One camera of so many rows."""
-        width = max(1, round(height * self.aspect))
-        focal = height / 2 / math.tan(self.fov / 2)
-        size = {"width": width, "height": height}
-        return Cameras.of(self.pose[None], fx=focal, fy=focal, cx=width / 2, cy=height / 2, **size)
+        width, focal = max(1, round(height * self.aspect)), height / 2 / math.tan(self.fov / 2)
+        middle = {"cx": width / 2, "cy": height / 2}
+        return Cameras.of(self.pose[None], fx=focal, fy=focal, **middle, width=width, height=height)
+
+    def draw(self, scene: Any, name: str, scale: float, color: tuple[int, int, int], image: Any = None) -> Any:
+        """Add a frustum to viser's scene."""
+        lens, pose = {"fov": self.fov, "aspect": self.aspect}, {"wxyz": self.wxyz, "position": self.pose[:, 3]}
+        line = {"thickness": 1.5, "thickness_units": "screen", "color": color}
+        return scene.add_camera_frustum(name, **lens, **pose, **line, scale=0.03 * scale, image=image)
 
 
-def camera_path(keyframes: list[View], seconds: float, fps: int, height: int) -> dict[str, Any]:
-    """The content of a camera_path.json of nerfstudio's viewer (1.1.5) that leads through keyframes, in the data's
-    world units: positions on a Catmull-Rom spline, rotations at an even rate between two, the first one's aspect."""
+def camera_path(keyframes: list[View], seconds: float, height: int) -> dict[str, Any]:
+    """The content of a camera_path.json, as nerfstudio's viewer writes it (1.1.5), in the data's world units, through
+    keyframes: positions on a Catmull-Rom spline, rotations at an even rate between two, the first one's aspect."""
     rotations = torch.from_numpy(np.stack([view.pose[:, :3] for view in keyframes]))
     values = np.stack([np.append(view.pose[:, 3], view.fov) for view in keyframes])
-    values = np.concatenate((values[:1], values, values[-1:]))
-    aspect, frames = keyframes[0].aspect, []
-    for t in np.linspace(0, len(keyframes) - 1, max(1, round(seconds * fps))):
-        k = min(int(t), max(len(keyframes) - 2, 0))
-        u, following = t - k, min(k + 1, len(keyframes) - 1)
-        turned = rotation_power(rotations[k].T @ rotations[following], u)
-        a, b, c, d = (values[min(k + i, len(values) - 1)] for i in range(4))
-        at = b + u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * b - 3 * c + d - a))) / 2
-        frames.append({"camera_to_world": _matrix((rotations[k] @ turned).numpy(), at[:3]), **_lens(at[3], aspect)})
-    ends = [
-        {"matrix": _matrix(view.pose[:, :3], view.pose[:, 3]), **_lens(view.fov, view.aspect)} for view in keyframes
-    ]
-    return {
-        "default_fov": math.degrees(keyframes[0].fov),
-        "default_transition_sec": seconds / max(1, len(keyframes) - 1),
-        "keyframes": ends,
-        "camera_type": "perspective",
-        "render_height": height,
-        "render_width": max(1, round(height * aspect)),
-        "fps": fps,
-        "seconds": seconds,
-        "is_cycle": False,
-        "smoothness_value": 0.0,
-        "camera_path": frames,
-    }
-
-
-def _lens(fov: float, aspect: float) -> dict[str, float]:
-    return {"fov": math.degrees(fov), "aspect": aspect}
-
-
-def _matrix(rotation: np.ndarray, position: np.ndarray) -> list[float]:
-    """(4, 4), row by row."""
-    return np.vstack((np.column_stack((rotation, position)), (0.0, 0.0, 0.0, 1.0))).ravel().tolist()
+    last, aspect, frames = len(keyframes) - 1, keyframes[0].aspect, []
+    for t in np.linspace(0, last, max(1, round(seconds * FPS))):
+        k = min(int(t), max(0, last - 1))
+        before, start, end, after = (values[min(max(i, 0), last)] for i in range(k - 1, k + 3))
+        turned = rotation_power(rotations[k].T @ rotations[min(k + 1, last)], u := t - k)
+        quadratic, cubic = 2 * before - 5 * start + 4 * end - after, 3 * start - before - 3 * end + after
+        x, y, z, fov = start + u * (end - before + u * (quadratic + u * cubic)) / 2
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack(((rotations[k] @ turned).numpy(), (x, y, z)))
+        frame = {"camera_to_world": matrix.ravel().tolist(), "fov": math.degrees(fov), "aspect": aspect}
+        frames.append(frame)
+    size = {"render_height": height, "render_width": max(1, round(height * aspect))}
+    return {"camera_type": "perspective", **size, "fps": FPS, "seconds": seconds, "camera_path": frames}

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import viser.transforms as tf
 
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, write_atomically
+from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.run_folder import RunFolder
@@ -20,8 +21,8 @@ from edge_se_sampler.viewer.camera_path import View
 from edge_se_sampler.viewer.server import set_initial_camera, start_server
 from edge_se_sampler.viewer.viewed import Viewed
 
-NUM_POINTS, RAYS_PER_LOOK, MAX_LOOKS = 100_000, 2**14, 64
-"""Points, and how many rays are rendered at once, and how often at most, until there are so many."""
+NUM_LOOKS, RAYS_PER_LOOK = 32, 2**14
+"""Of the rays at whose ends there are points."""
 TURN_SECONDS, TURN_STEPS = 12.0, 180
 """Of the turntable."""
 
@@ -35,20 +36,16 @@ def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
     with start_server(ViewerConfig(port=0)) as server:
         focus, scale = set_initial_camera(server, viewed)
         table = server.scene.add_frame("/turntable", show_axes=False, position=focus)
-        size = 2 * scale / float(viewed.cameras.fy.max())
-        server.scene.add_point_cloud(
-            "/turntable/points", points - focus, colors, point_size=size, point_shape="circle", precision="float32"
-        )
+        look: dict[str, Any] = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
+        size = scale / float(viewed.cameras.fy.max())  # of a pixel
+        server.scene.add_point_cloud("/turntable/points", points - focus, colors, point_size=size, **look)
         for k in range(len(viewed.cameras)):
             view = View.of_training(viewed.cameras, k)
-            lens = {"fov": view.fov, "aspect": view.aspect, "scale": 0.06 * scale}
-            position = view.pose[:, 3] - focus
-            server.scene.add_camera_frustum(f"/turntable/{k}", **lens, wxyz=view.wxyz, position=position)
-        up = viewed.cameras.camera_to_worlds[:, :, 1].mean(dim=0).double().cpu().numpy()
+            view.pose[:, 3] -= focus
+            view.draw(server.scene, f"/turntable/{k}", scale, (60, 60, 60))
         recording = server.get_scene_serializer()
         for step in range(TURN_STEPS):
-            turned = tf.SO3.exp(up / np.linalg.norm(up) * 2 * math.pi * step / TURN_STEPS)
-            table.wxyz = turned.wxyz
+            table.wxyz = tf.SO3.exp(viewed.up * 2 * math.pi * step / TURN_STEPS).wxyz
             recording.insert_sleep(TURN_SECONDS / TURN_STEPS)
         write_atomically(path, recording.as_html().encode())
 
@@ -56,20 +53,18 @@ def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
 def surface_points(viewed: Viewed) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 3), world units, and their colors (m, 3) uint8: where random rays of the training views see something
     with an accumulation above a half."""
-    trainer, model, points, colors = viewed.trainer, viewed.model, [], []
-    rng, far = stream(trainer.config.machine.seed, 0, Stream.PROBE), model.config.depths[1]
-    with Progress(NUM_POINTS, "looking for points") as progress:
-        for _ in range(MAX_LOOKS):
-            rays = trainer.pipeline.datamanager.probe_rays(RAYS_PER_LOOK, rng)
-            found = render_outputs(model, rays, ["rgb_fine", "accumulation_fine", "depth_fine"])
-            opaque = found["accumulation_fine"].clamp(min=0.5)  # what is behind is at the far depth, on the background
-            behind = 1 - found["accumulation_fine"]
-            distance = (found["depth_fine"] - behind * far * rays.metadata["directions_norm"].cpu()) / opaque
-            color = (found["rgb_fine"] - behind * model.config.background_level) / opaque
-            seen = found["accumulation_fine"][:, 0] > 0.5
-            points.append((rays.origins.cpu() + distance * rays.directions.cpu())[seen])
-            colors.append((color[seen].clamp(0, 1) * 255).byte())
-            progress.update(min(NUM_POINTS, sum(map(len, points))))
-            if sum(map(len, points)) >= NUM_POINTS:
-                break
-    return torch.cat(points)[:NUM_POINTS].double().numpy(), torch.cat(colors)[:NUM_POINTS].numpy()
+    model, found = viewed.model, []
+    rng, far = stream(viewed.trainer.config.machine.seed, 0, Stream.PROBE), model.config.depths[1]
+    with Progress(NUM_LOOKS, "looking for points") as progress:
+        for look in range(NUM_LOOKS):
+            rays = viewed.trainer.pipeline.datamanager.probe_rays(RAYS_PER_LOOK, rng)
+            outputs = render_outputs(model, rays, ["rgb_fine", "accumulation_fine", "depth_fine"])
+            accumulation = outputs["accumulation_fine"]
+            behind = (1 - accumulation).to(rays.origins)  # at the far depth, in the background's color
+            depth = outputs["depth_fine"].to(behind) - behind * far * rays.metadata["directions_norm"]
+            position = (rays.origins + depth / (1 - behind) * rays.directions).cpu()
+            color = (outputs["rgb_fine"] - behind.cpu() * model.config.background_level) / accumulation
+            found.append(torch.cat((position, color), dim=1)[accumulation[:, 0] > 0.5])
+            progress.update(look + 1)
+    points = torch.cat(found).double().numpy()
+    return points[:, :3], to_uint8(points[:, 3:])

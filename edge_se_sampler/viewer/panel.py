@@ -18,8 +18,6 @@ from edge_se_sampler.viewer.viewed import Viewed
 IDLE_SECONDS, IDLE_SHARE = 0.25, 4.0
 """Between two looks whether the weights have changed: at least so long, and so many times as long as the last picture
 took, for they change all the time in training, which should not wait for someone who may have left."""
-FPS = 24
-"""Of camera paths."""
 
 
 class Panel:
@@ -29,11 +27,11 @@ class Panel:
     def __init__(self, client: viser.ClientHandle, viewed: Viewed, scale: float) -> None:
         self.client, self.viewed, self.scale = client, viewed, scale
         self.renderer = Renderer(viewed)
-        self.selected: int | None = None
+        self.selected = 0
         self.keyframes: list[View] = []
         self._changed, self._closed = threading.Event(), False
         self._add_controls()
-        self._add_cameras()
+        self.frusta = [self._add_camera(k) for k in range(len(viewed.cameras))]
         client.camera.on_update(self._refresh)
         self._refresh()
         threading.Thread(target=self._run, daemon=True).start()
@@ -57,7 +55,7 @@ class Panel:
         for name, find in (("Occupied cells", self.viewed.occupied_cells), ("Hull", self.viewed.hull_cells)):
             self._add_layer(name, False, find)
         with gui.add_folder("Training view"):
-            self.title = gui.add_markdown("Click a camera.")
+            self.title = gui.add_markdown("")
             self.kind = gui.add_dropdown("Beside", ("image", "error", "probability"))
             self.kind.on_update(self._refresh)
             self.image = gui.add_image(np.full((1, 1, 3), 255, np.uint8))
@@ -82,16 +80,13 @@ class Panel:
                 )
             frame.visible = box.value
 
-    def _add_cameras(self) -> None:
-        cameras = self.viewed.cameras
-        for k in range(len(cameras)):
-            thumbnail = self.viewed.image(k, stride=-(-int(cameras.height[k]) // 64))
-            frustum = self._add_frustum(f"/Cameras/{k}", View.of_training(cameras, k), (60, 60, 60), thumbnail)
-            frustum.on_click(lambda _, k=k: self._select(k))
-
-    def _add_frustum(self, name: str, view: View, color: tuple[int, int, int], image: np.ndarray | None = None) -> Any:
-        lens = {"fov": view.fov, "aspect": view.aspect, "scale": 0.06 * self.scale, "color": color, "image": image}
-        return self.client.scene.add_camera_frustum(name, **lens, wxyz=view.wxyz, position=view.pose[:, 3])
+    def _add_camera(self, k: int) -> Any:
+        """A training camera's frustum, which can be clicked."""
+        thumbnail = self.viewed.image(k, stride=-(-int(self.viewed.cameras.height[k]) // 64))
+        view = View.of_training(self.viewed.cameras, k)
+        frustum = view.draw(self.client.scene, f"/Cameras/{k}", self.scale, (60, 60, 60), thumbnail)
+        frustum.on_click(lambda _: self._select(k))
+        return frustum
 
     def _select(self, k: int) -> None:
         """Look from a training camera, and show its image beside."""
@@ -103,7 +98,8 @@ class Panel:
 
     def _add_keyframe(self, _: Any) -> None:
         self.keyframes.append(View.of(self.client.camera))
-        self._add_frustum(f"/Keyframes/{len(self.keyframes)}", self.keyframes[-1], (200, 10, 30))
+        name = f"/Keyframes/{len(self.keyframes)}"
+        self.keyframes[-1].draw(self.client.scene, name, self.scale, (200, 10, 30))
 
     def _clear(self, _: Any) -> None:
         self.keyframes = []
@@ -116,7 +112,7 @@ class Panel:
             return
         height = int(self.viewed.cameras.height.max())
         try:
-            write_json(path, camera_path(self.keyframes, self.seconds.value, FPS, height))
+            write_json(path, camera_path(self.keyframes, self.seconds.value, height))
             self.client.add_notification("Saved", f"edge-se render {path.parent} --camera-path {path}")
         except InputError as problem:
             self.client.add_notification("Not saved", str(problem), color="red")
@@ -135,12 +131,14 @@ class Panel:
     def _show(self, moved: bool) -> None:
         """Show what the camera sees: if it has moved, at once, and then sharper and sharper until it moves again."""
         view, output = View.of(self.client.camera), self.output.value
+        for frustum in self.frusta:  # not those that the camera is in, which would hide the picture
+            frustum.visible = bool(np.linalg.norm(frustum.position - view.pose[:, 3]) > 0.05 * self.scale)
         full = max(1, min(int(self.height.value), self.client.camera.image_height))
         heights = choose_heights(self.renderer.frame.rays, view.aspect, full)
         for height in heights if moved else heights[-1:]:
             first = moved and height == heights[0]  # never interrupted: who keeps moving must see something, too
             began, camera = time.monotonic(), view.camera(height)
-            picture = self.renderer.picture(camera, output, lambda: False if first else self._changed.is_set())
+            picture = self.renderer.picture(camera, output, (lambda: False) if first else self._changed.is_set)
             if picture is None:
                 return
             self.client.scene.set_background_image(picture, format="jpeg", jpeg_quality=75 if first else 95)
@@ -151,8 +149,7 @@ class Panel:
 
     def _show_beside(self) -> None:
         k, kind = self.selected, self.kind.value
-        if k is None:
-            return
         picture = self.renderer.beside(k, kind, self._changed.is_set)
         if picture is not None:
-            self.image.image, self.title.content = picture, f"View {k}: {kind}"
+            strategy = f" under {self.viewed.strategy}" if kind == "probability" else ""
+            self.image.image, self.title.content = picture, f"View {k}: {kind}{strategy}"

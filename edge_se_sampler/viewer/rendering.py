@@ -55,10 +55,11 @@ class Renderer:
         self.viewed, self.frame, self.turn = viewed, Pace(FRAME_SECONDS), Pace(TURN_SECONDS)
 
     def render(
-        self, camera: Cameras, keys: Sequence[str], interrupted: Callable[[], bool] = lambda: False
+        self, camera: Cameras, keys: Sequence[str], interrupted: Callable[[], bool], depths: tuple[float, float] | None
     ) -> dict[str, Tensor] | None:
-        """Some of the model's outputs (H, W, channels) for the first of cameras, on the CPU; None: interrupted. A turn
-        ends after some rays: training goes on, others look, and whether it is still wanted is asked again."""
+        """Some of the model's outputs (H, W, channels) for a camera, on the CPU; None: interrupted. A turn ends after
+        some rays: training goes on, others look, and whether the picture is still wanted is asked again. lean-nerf
+        samples rays between `depths`, world units from the camera, if there are any, instead of the model's."""
         height, width = int(camera.height[0]), int(camera.width[0])
         count, first, turns, began = height * width, 0, [], time.monotonic()
         while first < count:
@@ -68,7 +69,10 @@ class Renderer:
             with self.viewed.turns:
                 turn_began, model = time.monotonic(), self.viewed.model
                 pixels = torch.stack((torch.zeros_like(pixel), pixel // width, pixel % width), dim=1)
-                turns.append(render_outputs(model, camera.to(model.device, torch.float32).pixel_rays(pixels), keys))
+                rays = camera.to(model.device, torch.float32).pixel_rays(pixels)
+                for name, depth in zip(("nears", "fars"), depths or (), strict=False):
+                    rays.metadata[name] = torch.full_like(rays.directions[:, :1], depth)
+                turns.append(render_outputs(model, rays, keys))
                 self.turn.record(len(pixel), time.monotonic() - turn_began)
             first += len(pixel)
         self.frame.record(count, time.monotonic() - began)
@@ -77,7 +81,8 @@ class Renderer:
     def picture(self, camera: Cameras, output: str, interrupted: Callable[[], bool]) -> np.ndarray | None:
         """One of OUTPUTS as (H, W, 3) uint8; None: interrupted."""
         keys = ["rgb_fine"] if output == "rgb" else ["accumulation_fine", "depth_fine"]
-        found = self.render(camera, keys, interrupted)
+        # from farther off than any training view, or nearer by
+        found = self.render(camera, keys, interrupted, depths=(0.0, math.inf))
         if found is None:
             return None
         if output == "rgb":
@@ -91,7 +96,7 @@ class Renderer:
 
     def squared_error(self, k: int, interrupted: Callable[[], bool]) -> np.ndarray | None:
         """(H, W) squared error of every pixel of the kth training view, a mean over channels; None: interrupted."""
-        found = self.render(self.viewed.cameras[[k]], ["rgb_fine"], interrupted)
+        found = self.render(self.viewed.cameras[[k]], ["rgb_fine"], interrupted, depths=None)
         if found is None:
             return None
         return np.square(found["rgb_fine"].numpy() - unit_float(self.viewed.image(k))).mean(axis=2)

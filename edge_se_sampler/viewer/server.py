@@ -52,7 +52,7 @@ def open_viewer(viewed: Viewed, address: ViewerConfig) -> Iterator[viser.ViserSe
     """Show a run to whoever opens the page, whose address is printed."""
     with start_server(address) as server:
         panels: dict[int, Panel] = {}
-        _, scale = set_initial_camera(server, viewed)
+        scale = set_initial_camera(server, viewed)[1]
 
         @server.on_client_connect
         def _(client: viser.ClientHandle) -> None:
@@ -91,12 +91,11 @@ def start_server(address: ViewerConfig) -> Iterator[viser.ViserServer]:
 def set_initial_camera(server: viser.ViserServer, viewed: Viewed) -> tuple[np.ndarray, float]:
     """Begin at the first training camera, looking at what all of them look at; returns that point (3,), and how far it
     is from them, world units."""
-    cameras = viewed.cameras.to("cpu", torch.float64)
-    focus, depth = find_focus(cameras)
+    focus, depth = find_focus(viewed.cameras.to("cpu", torch.float64))
     scale = max(float(np.median(np.abs(depth))), 1e-9)
     view, start = View.of_training(viewed.cameras, 0), server.initial_camera
     ahead = max(float(depth[0]), 0.1 * scale)
-    server.scene.set_up_direction(cameras.camera_to_worlds[:, :, 1].mean(dim=0).numpy())
+    server.scene.set_up_direction(viewed.up)
     start.position, start.look_at, start.fov = view.pose[:, 3], view.pose[:, 3] - ahead * view.pose[:, 2], view.fov
     start.near, start.far = 0.01 * scale, 100 * scale
     return focus, scale

@@ -91,9 +91,20 @@ class Viewed:
         return self.trainer.pipeline.model
 
     @property
+    def strategy(self) -> str | None:
+        """Name of the current strategy of drawing pixels; None: the pixel sampler is not one of ours."""
+        return getattr(self.trainer.pipeline.datamanager.train_pixel_sampler, "strategy", None)
+
+    @property
     def cameras(self) -> Cameras:
         """Those of the training views."""
         return self.trainer.pipeline.datamanager.cameras
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit vector: what is above in most of them."""
+        up = self.cameras.camera_to_worlds[:, :, 1].double().cpu().numpy().mean(axis=0)
+        return up / max(float(np.linalg.norm(up)), 1e-9)
 
     def image(self, k: int, stride: int = 1) -> np.ndarray:
         """Every so many pixels, both ways, of the kth training image on the model's background, (H, W, 3) uint8."""
