@@ -21,8 +21,8 @@ from edge_se_sampler.viewer.camera_path import View
 from edge_se_sampler.viewer.server import set_initial_camera, start_server
 from edge_se_sampler.viewer.viewed import Viewed
 
-NUM_LOOKS, RAYS_PER_LOOK = 32, 2**14
-"""Of the rays at whose ends there are points."""
+NUM_POINTS, RAYS_PER_LOOK, MAX_LOOKS = 100_000, 2**14, 64
+"""Rays are rendered, so many at once, until there are so many points at their ends."""
 TURN_SECONDS, TURN_STEPS = 12.0, 180
 """Of the turntable."""
 
@@ -55,8 +55,8 @@ def surface_points(viewed: Viewed) -> tuple[np.ndarray, np.ndarray]:
     with an accumulation above a half."""
     model, found = viewed.model, []
     rng, far = stream(viewed.trainer.config.machine.seed, 0, Stream.PROBE), model.config.depths[1]
-    with Progress(NUM_LOOKS, "looking for points") as progress:
-        for look in range(NUM_LOOKS):
+    with Progress(NUM_POINTS, "looking for points") as progress:
+        for _ in range(MAX_LOOKS):
             rays = viewed.trainer.pipeline.datamanager.probe_rays(RAYS_PER_LOOK, rng)
             outputs = render_outputs(model, rays, ["rgb_fine", "accumulation_fine", "depth_fine"])
             accumulation = outputs["accumulation_fine"]
@@ -65,6 +65,8 @@ def surface_points(viewed: Viewed) -> tuple[np.ndarray, np.ndarray]:
             position = (rays.origins + depth / (1 - behind) * rays.directions).cpu()
             color = (outputs["rgb_fine"] - behind.cpu() * model.config.background_level) / accumulation
             found.append(torch.cat((position, color), dim=1)[accumulation[:, 0] > 0.5])
-            progress.update(look + 1)
+            progress.update(min(NUM_POINTS, count := sum(map(len, found))))
+            if count >= NUM_POINTS:
+                break
     points = torch.cat(found).double().numpy()
     return points[:, :3], to_uint8(points[:, 3:])
