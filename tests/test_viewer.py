@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import signal
 import socket
@@ -23,7 +22,7 @@ import numpy as np
 import pytest
 import torch
 from lean_models import VIEWS, config_of
-from tiny import tiny_trainer
+from tiny import SMALL, tiny_trainer
 
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.checkpoint import load_checkpoint, save_checkpoint
@@ -267,6 +266,24 @@ def test_a_browser_sees_a_small_picture_at_once_and_then_a_sharp_one_until_it_mo
     panel.close()
 
 
+def test_the_next_move_interrupts_what_becomes_sharp(viewed: Viewed) -> None:
+    client = FakeClient()
+    panel, moves = client.panel(viewed), []
+    panel.renderer.frame = SimpleNamespace(rays=600, record=lambda *_: None)  # type: ignore[assignment]
+    wait_until(lambda: client.pictures and len(client.pictures[-1]) == 128)
+    count = len(client.pictures)
+
+    def move_once(*_: Any) -> None:
+        if len(client.pictures) == count + 1 and not moves:  # the second picture is being rendered
+            moves.append(client.move(0.2))
+
+    panel.renderer.turn = SimpleNamespace(rays=300, record=move_once)  # type: ignore[assignment]
+    client.move(0.1)
+    wait_until(lambda: len(client.pictures) > count and len(client.pictures[-1]) == 128)
+    assert [len(picture) for picture in client.pictures[count:]] == [20, 20, 40, 80, 128]
+    panel.close()
+
+
 def test_a_slow_browser_stalls_neither_training_nor_others(viewed: Viewed) -> None:
     stuck, slow = threading.Event(), threading.Event()
 
@@ -386,17 +403,32 @@ def test_without_viser_the_extra_is_named(run: Path, edge_se, monkeypatch: pytes
         assert "edge-se-sampler[view]" in answer.err
 
 
-def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path) -> None:
-    command = [sys.executable, "-m", "edge_se_sampler.cli", "view", str(run), "--port", "0"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
-    ) as process:
+@pytest.mark.parametrize("trains", [False, True])
+def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, tmp_path: Path, trains: bool) -> None:
+    flags = ["view", run, "--port", 0]
+    if trains:
+        flags = [
+            "train",
+            "edge-se-nerf",
+            "--data",
+            scene,
+            "--output-dir",
+            tmp_path,
+            *SMALL,
+            "--view",
+            "--viewer.port",
+            0,
+        ]
+    command = [sys.executable, "-m", "edge_se_sampler.cli", *map(str, flags)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         found = re.search(r"http://127\.0\.0\.1:(\d+)", process.stdout.readline())
         assert found is not None
         assert int(found[1]) > 0
         page = urllib.request.urlopen(found[0], timeout=10).read()
         assert b"<html" in page.lower()
+        if trains:
+            wait_until(lambda: "goes on until Ctrl-C" in process.stdout.readline())  # type: ignore[union-attr]
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=20)
     assert (process.returncode, out, err) == (0, "", "")
