@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +16,7 @@ from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoi
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 
 if TYPE_CHECKING:
     from edge_se_sampler.data.views import Views
@@ -98,6 +99,29 @@ class Offcenter:
 @dataclass(frozen=True)
 class Train:
     """Train a method on a folder of images and cameras: edge-se train METHOD --data DIR."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What edge-se train METHOD takes."""
+
+    config: Annotated[TrainerConfig, tyro.conf.arg(name="")]
+    view: tyro.conf.UseCounterAction[int] = 0
+    """Fly through the model in the browser while it trains."""
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
+
+    def run(self) -> None:
+        if self.view:
+            self.viewer.check()
+        from edge_se_sampler.engine.session import prepare
+
+        trainer = prepare(self.config)
+        if not self.view:
+            train(trainer)
+            return
+        from edge_se_sampler.viewer.server import view_training
+
+        view_training(trainer, self.viewer, train)
 
 
 @dataclass(frozen=True)
@@ -185,6 +209,26 @@ class Export(_RunCommand):
 
     def run(self) -> None:
         print(self.what.export(*self._load()))
+
+
+@dataclass(frozen=True)
+class View(ViewerConfig, _RunCommand):
+    """Fly through a run in the browser; another process may be training it."""
+
+    html: Path | None = None
+    """Write one html file that needs no server instead: points, cameras and a turntable."""
+
+    def run(self) -> None:
+        check_viser()
+        if self.html is None:
+            from edge_se_sampler.viewer.server import view_run
+
+            view_run(*self._load(), self)
+        else:
+            from edge_se_sampler.viewer.html import write_html
+
+            write_html(*self._load(), self.html)
+            print(self.html)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +333,7 @@ class Bench:
     """Run the experiments and timings behind the published numbers."""
 
 
-_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, Show, Inspect, Methods, Bench)
+_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, View, Show, Inspect, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
 
 
