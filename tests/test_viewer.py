@@ -11,7 +11,8 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -336,7 +337,7 @@ def test_a_viewed_training_has_bit_for_bit_the_weights_of_another(tmp_path: Path
         wait_until(lambda: client.pictures)
 
     alone, seen = trained(tmp_path / "alone"), trained(tmp_path / "viewed", view)
-    assert len(client.pictures) > 5
+    assert len(client.pictures) > 1  # the first was waited for: at least one more while it trained
     assert int(seen.pipeline.model.grid.level) > 0  # cells have been subdivided under the viewer's eyes
     states = [trainer.pipeline.model.state_dict() for trainer in (alone, seen)]
     for name, value in states[0].items():
@@ -403,6 +404,15 @@ def test_without_viser_the_extra_is_named(run: Path, edge_se, monkeypatch: pytes
         assert "edge-se-sampler[view]" in answer.err
 
 
+@contextmanager
+def ended(process: subprocess.Popen) -> Iterator[None]:
+    """Whatever fails, nothing waits for the process."""
+    try:
+        yield
+    finally:
+        process.kill()
+
+
 @pytest.mark.parametrize("trains", [False, True])
 def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, tmp_path: Path, trains: bool) -> None:
     flags = ["view", run, "--port", 0]
@@ -420,7 +430,17 @@ def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, 
             0,
         ]
     command = [sys.executable, "-m", "edge_se_sampler.cli", *map(str, flags)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with (
+        subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # ignored, where a shell started the tests with &
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        ) as process,
+        ended(process),
+    ):
         assert process.stdout is not None
         found = re.search(r"http://127\.0\.0\.1:(\d+)", process.stdout.readline())
         assert found is not None
