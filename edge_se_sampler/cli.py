@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn, Union
 import tyro
 
 from edge_se_sampler.bench.commands import BENCHES
-from edge_se_sampler.commands import COMMANDS, train
+from edge_se_sampler.commands import COMMANDS, Training
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
 
@@ -58,13 +58,10 @@ def _run(arguments: list[str]) -> None:
     elif arguments[:1] == ["train"]:
         methods = {name: method.specification for name, method in registered_methods().items()}
         configs = tyro.extras.subcommand_type_from_defaults(
-            {name: method.config for name, method in methods.items()},
+            {name: Training(method.config) for name, method in methods.items()},
             {name: method.description for name, method in methods.items()},
         )
-        config = _parse(_subcommands(COMMANDS | {"train": _nested(configs)}), arguments).chosen
-        from edge_se_sampler.engine.session import prepare
-
-        train(prepare(config))
+        _parse(_subcommands(COMMANDS | {"train": _nested(configs)}), arguments).chosen.run()
     elif arguments[:1] == ["bench"]:
         _parse(_subcommands(COMMANDS | {"bench": _nested(_subcommands(BENCHES))}), arguments).chosen.run()
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,9 +12,11 @@ import tyro
 from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import check_value
+from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
 from edge_se_sampler.methods import method_configs, registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
+from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 
 if TYPE_CHECKING:
     from edge_se_sampler.data.views import Views
@@ -23,12 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Demo:
-    """Train Random and Edge + SE on an off-center, mostly white scene, and compare them: a few minutes."""
+    """Train Random, Edge + SE and lean-nerf on an off-center, mostly white scene, and compare them: three minutes."""
 
     output_dir: Path = Path()
-    """Folder for demo.png, demo.json and demo/ (the scene and the runs)."""
+    """Folder for demo.html, demo.png, demo.gif, demo.json and demo/ (the scene and the runs)."""
     seed: int = 0
-    """Seed of weights, pixels and jitter; both methods start from the same weights."""
+    """Seed of weights, pixels and jitter; Random and Edge + SE start from the same weights."""
 
     def run(self) -> None:
         from edge_se_sampler.bench.demo import METHODS, run_demo
@@ -36,7 +38,7 @@ class Demo:
         for method, measured in run_demo(self.output_dir, self.seed)["methods"].items():
             psnr, seconds = measured["results"]["psnr"], measured["training_seconds"]
             print(f"{METHODS[method]:>9}: {psnr:.2f} dB in {seconds:.0f} s of training")
-        print(f"see {self.output_dir / 'demo.png'} and {self.output_dir / 'demo.json'}")
+        print(f"see {self.output_dir / 'demo.html'} (in a browser), demo.png, demo.gif and demo.json")
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,29 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Training:
+    """What edge-se train METHOD takes."""
+
+    config: Annotated[TrainerConfig, tyro.conf.arg(name="")]
+    view: tyro.conf.UseCounterAction[int] = 0
+    """Fly through the model in the browser while it trains."""
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
+
+    def run(self) -> None:
+        if self.view:
+            self.viewer.check()
+        from edge_se_sampler.engine.session import prepare
+
+        trainer = prepare(self.config)
+        if not self.view:
+            train(trainer)
+            return
+        from edge_se_sampler.viewer.server import view_training
+
+        view_training(trainer, self.viewer, train)
+
+
+@dataclass(frozen=True)
 class _RunCommand:
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run's folder."""
@@ -142,22 +167,68 @@ class Eval(_RunCommand):
 
 @dataclass(frozen=True)
 class Render(_RunCommand):
-    """Render a run as a video."""
+    """Render a run as a video, or as a folder of frames."""
 
     output_path: Path = Path("render.gif")
-    """The video to write, .gif or .mp4 (extra [video])."""
-    kind: Literal["spiral", "test"] = "spiral"
-    """Cameras on a spiral around the scene, or the held-out ones."""
+    """The video to write, .gif or .mp4 (extra [video]). Without an ending it is a folder: OUTPUT/00000.png and so on,
+    and frames.json, which says what they are; what was interrupted there goes on."""
+    outputs: tuple[Literal["rgb", "rgba", "accumulation", "depth", "raw-depth"], ...] = ("rgb",)
+    """What to show, side by side in a video: colors; in folders alone, colors with straight alpha; opacity; depth in
+    colors, near is red; in folders alone, depth along the optical axis as 16 bits, in the units that frames.json
+    says."""
+    kind: Literal["spiral", "interpolate", "train", "test"] | None = None
+    """Cameras: a turn around what the training views look at, or to and fro where they are on one side of it (spiral,
+    the default); a path through the training views in their order; the training views; the held-out ones."""
+    camera_path: Path | None = None
+    """Cameras of nerfstudio's viewer (camera_path.json) in place of a kind, in the units and axes of the run's data."""
     num_frames: int = 60
-    """Frames of the spiral."""
-    frames_per_second: int = 20
-    """Frame rate of the video."""
+    """Frames of spiral and interpolate."""
+    frames_per_second: float | None = None
+    """Frame rate of the video; by default the camera path's, or 20."""
+    depth_unit: float | None = None
+    """What 1 means in raw-depth, world units; by default the power of ten that lets 16 bits reach to the far depth."""
 
     def run(self) -> None:
         from edge_se_sampler.engine.video import render_run
 
-        render_run(*self._load(), self.output_path, self.kind, self.num_frames, self.frames_per_second)
+        render_run(*self._load(), **{key: value for key, value in vars(self).items() if key != "run_folder"})
         print(self.output_path)
+
+
+@dataclass(frozen=True)
+class Export(_RunCommand):
+    """Take a run to other programs: edge-se export RUN mesh|points|cameras|splats."""
+
+    what: Annotated[
+        Annotated[ExportMesh, tyro.conf.subcommand("mesh")]
+        | Annotated[ExportPoints, tyro.conf.subcommand("points")]
+        | Annotated[ExportCameras, tyro.conf.subcommand("cameras")]
+        | Annotated[ExportSplats, tyro.conf.subcommand("splats")],
+        tyro.conf.arg(name=""),
+    ]
+
+    def run(self) -> None:
+        print(self.what.export(*self._load()))
+
+
+@dataclass(frozen=True)
+class View(ViewerConfig, _RunCommand):
+    """Fly through a run in the browser; another process may be training it."""
+
+    html: Path | None = None
+    """Write one html file that needs no server instead: points, cameras and a turntable."""
+
+    def run(self) -> None:
+        check_viser()
+        if self.html is None:
+            from edge_se_sampler.viewer.server import view_run
+
+            view_run(*self._load(), self)
+        else:
+            from edge_se_sampler.viewer.html import write_html
+
+            write_html(*self._load(), self.html)
+            print(self.html)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +333,7 @@ class Bench:
     """Run the experiments and timings behind the published numbers."""
 
 
-_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Show, Inspect, Methods, Bench)
+_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, View, Show, Inspect, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
 
 

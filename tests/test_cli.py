@@ -51,8 +51,34 @@ def test_eval_writes_valid_json_with_nerfstudios_keys(run: Path, tmp_path: Path,
 
 def test_render_gif(run: Path, tmp_path: Path, edge_se):
     path = tmp_path / "turn.gif"
-    assert edge_se("render", run, "--output-path", path, "--num-frames", 3).code == 0
-    assert iio.imread(path).shape[:3] == (3, 24, 24)
+    assert edge_se("render", run, "--output-path", path, "--num-frames", 3, "--outputs", "rgb", "depth").code == 0
+    assert iio.imread(path, index=None).shape == (3, 24, 48, 3)
+
+
+@pytest.mark.parametrize(("kind", "count"), [("interpolate", 4), ("train", 3), ("test", 1)])
+def test_render_views_and_between_them(kind: str, count: int, run: Path, tmp_path: Path, edge_se):
+    folder = tmp_path / "frames"
+    flags = ["--kind", kind, "--num-frames", 4, "--outputs", "rgb", "rgba"]
+    assert edge_se("render", run, "--output-path", folder, *flags).code == 0
+    assert len(list(folder.glob("rgb/*.png"))) == len(list(folder.glob("rgba/*.png"))) == count
+    shown = json.loads((folder / "frames.json").read_text())["frames"]
+    split = "test" if kind == "test" else "train"
+    poses = json.loads((run.parents[3] / "scene" / f"transforms_{split}.json").read_text())["frames"]
+    pairs = [(shown[0], poses[0]), (shown[-1], poses[-1])]
+    assert all(np.allclose(a["transform_matrix"], b["transform_matrix"], atol=1e-6) for a, b in pairs)
+
+
+def test_render_a_camera_path_at_its_rate(run: Path, scene: Path, tmp_path: Path, edge_se):
+    poses = [frame["transform_matrix"] for frame in json.loads((scene / "transforms_train.json").read_text())["frames"]]
+    cameras = [{"camera_to_world": np.ravel(pose).tolist(), "fov": 39.6} for pose in poses[:2]]
+    path = {"camera_path": cameras, "render_height": 12, "render_width": 20, "fps": 10}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    flags = ["--camera-path", tmp_path / "path.json"]
+    assert edge_se("render", run, "--output-path", tmp_path / "a.gif", *flags).code == 0
+    assert iio.imread(tmp_path / "a.gif", index=None).shape == (2, 12, 20, 3)
+    assert iio.immeta(tmp_path / "a.gif")["duration"] == 100
+    assert edge_se("render", run, "--output-path", tmp_path / "a.gif", *flags, "--frames-per-second", 5).code == 0
+    assert iio.immeta(tmp_path / "a.gif")["duration"] == 200
 
 
 def test_show_and_methods(scene: Path, tmp_path: Path, edge_se):

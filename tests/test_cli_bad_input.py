@@ -235,6 +235,11 @@ class TestRuns:
         assert "--output-path" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "no" / "e.json")
         assert ".gif or .mp4" in refused(edge_se, run, "render", run, "--output-path", tmp_path / "x.avi")
         assert "--num-frames" in refused(edge_se, run, "render", run, "--num-frames", 0)
+        assert "--depth-unit" in refused(edge_se, run, "render", run, "--depth-unit", 1e-9)
+        both = ("--kind", "test", "--camera-path", tmp_path / "path.json")
+        assert "give one of them" in refused(edge_se, run, "render", run, *both)
+        assert "path.json" in refused(edge_se, run, "render", run, *both[2:])
+        assert "--outputs" in refused(edge_se, run, "render", run, "--outputs", "rgb", "rgb")
         for path in (".", tmp_path):
             assert "must name a file" in refused(edge_se, run, "eval", run, "--output-path", path)
 

@@ -22,12 +22,12 @@ LAYERS = [
     ("models",),
     ("engine",),
     ("methods",),
-    ("nerfstudio", "bench"),
+    ("nerfstudio", "bench", "export", "viewer"),
     ("commands",),
     ("cli",),
 ]
 """Files and folders of the package. Each may import from its own layer and from earlier ones."""
-HEAVY = {"torch", "numba", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio"}
+HEAVY = {"torch", "numba", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio", "viser"}
 
 
 def module_name(path: Path, root: Path) -> str:

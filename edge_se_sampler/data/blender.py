@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from edge_se_sampler.data.capture import SPLITS, Split
-from edge_se_sampler.data.frames import LoadSettings, Progress, load_views
-from edge_se_sampler.data.scene_file import SourceLocation, check_folder, read_json
+from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, load_views
+from edge_se_sampler.data.scene_file import JsonValue, SourceLocation, check_folder, read_json
 from edge_se_sampler.data.transforms_frames import read_entries, read_frames
 from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, Views
 
@@ -31,15 +31,19 @@ def read_blender(
     """Read one split of a scene; files that no frame lists are ignored. Poses are returned as written (not moved,
     scaled or orthonormalized). A frame without mask_path is trained on as a whole. InputError for anything that cannot
     be used: first of the folder, then of the json, then of the images."""
-    folder = Path(folder)
-    check_folder(folder)
-    _check_split(folder, split)
-    top = read_json(transforms_path(folder, split))
-    entries = read_entries(top, folder)
-    views = load_views(read_frames(entries), settings, progress)
+    frames, top = list_frames(Path(folder), split)
+    views = load_views(frames, settings, progress)
     # real scenes, whose units are their own, state focal lengths in pixels alone
     depths = NERF_SYNTHETIC_DEPTHS if "camera_angle_x" in top.object() else None
     return replace(views, depths=depths, data_format="blender")
+
+
+def list_frames(folder: Path, split: str) -> tuple[list[Frame], JsonValue]:
+    """The frames of one split, and the json that lists them; InputError as `read_blender`."""
+    check_folder(folder)
+    _check_split(folder, split)
+    top = read_json(transforms_path(folder, split))
+    return read_frames(read_entries(top, folder)), top
 
 
 def _check_split(folder: Path, split: str) -> None:

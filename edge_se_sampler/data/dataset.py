@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edge_se_sampler.data.blender import has_split, read_blender, transforms_path
-from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Split
+from edge_se_sampler.data.blender import list_frames as list_blender_frames
+from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Capture, Split
 from edge_se_sampler.data.colmap import read_colmap
 from edge_se_sampler.data.colmap_model import find_model
 from edge_se_sampler.data.config import DataFormat, Masks
-from edge_se_sampler.data.frames import LoadSettings, Progress, load_views
+from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
 from edge_se_sampler.data.scene_file import SourceLocation, check_folder
 from edge_se_sampler.data.transforms import read_transforms
@@ -78,10 +79,7 @@ def read_split(
         if split != "train" and not has_split(folder, split):
             return None
         return read_blender(folder, split, load, progress)
-    capture = READERS[data_format](folder)
-    _check_unsplit(settings, has_own_split=capture.splits is not None)
-    eval_every = EVAL_EVERY if settings.eval_every is None else settings.eval_every
-    rows = capture.select(split, eval_every)
+    capture, rows, eval_every = _read_capture(folder, split, settings, data_format)
     if split == "train":
         if capture.missing:
             print(capture.missing, file=sys.stderr)
@@ -91,8 +89,28 @@ def read_split(
         return None
     views = load_views([capture.frames[i] for i in rows], load, progress)
     points = None if capture.points is None else tuple(capture.points[i] for i in rows)
-    every = eval_every if capture.splits is None else None
-    return replace(views, points=points, depths=None, data_format=data_format, eval_every=every)
+    return replace(views, points=points, depths=None, data_format=data_format, eval_every=eval_every)
+
+
+def list_frames(folder: Path, split: Split, settings: DataSettings = DataSettings()) -> list[Frame]:
+    """The frames of one split of a folder, whose images are not decoded; none where val or test have none. InputError
+    for what cannot be used."""
+    data_format = find_format(folder, settings.data_format)
+    if data_format == "blender":
+        return list_blender_frames(folder, split)[0] if split == "train" or has_split(folder, split) else []
+    capture, rows, _ = _read_capture(folder, split, settings, data_format)
+    return [capture.frames[i] for i in rows]
+
+
+def _read_capture(
+    folder: Path, split: Split, settings: DataSettings, data_format: DataFormat
+) -> tuple[Capture, list[int], int | None]:
+    """A capture, the indices of a split's frames, and every how many of them one is held out; None: the data says
+    which."""
+    capture = READERS[data_format](folder)
+    _check_unsplit(settings, has_own_split=capture.splits is not None)
+    every = EVAL_EVERY if settings.eval_every is None else settings.eval_every
+    return capture, capture.select(split, every), every if capture.splits is None else None
 
 
 def _check_unsplit(settings: DataSettings, has_own_split: bool) -> None:

@@ -148,9 +148,15 @@ def _read_pose(matrix: JsonValue) -> np.ndarray:
     if len(rows) != 4 or any(not isinstance(row.value, list) or len(row.value) != 4 for row in rows):
         problem = f"must be 4 rows of 4 numbers, not {quote(matrix.value)}"
         raise matrix.location.error(problem, "write the 4x4 camera-to-world matrix")
-    pose = np.array([[entry.number() for entry in row.list()] for row in rows])
+    return rigid_pose(matrix, [entry for row in rows for entry in row.list()])
+
+
+def rigid_pose(matrix: JsonValue, entries: Sequence[JsonValue]) -> np.ndarray:
+    """The upper (3, 4) float64 of a camera-to-world matrix, by its 16 entries, row by row; InputError if that is not
+    rigid."""
+    pose = np.array([entry.number() for entry in entries]).reshape(4, 4)
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
-        problem = f"its last row must be [0, 0, 0, 1], not {quote(rows[3].value)}"
+        problem = f"its last row must be [0, 0, 0, 1], not {quote(pose[3].tolist())}"
         raise matrix.location.error(problem, "put the translation in the last column (transposed?)")
     r = pose[:3, :3].clip(-2, 2)  # no rotation has entries beyond 1, and products of large ones overflow
     if np.abs(r.T @ r - np.eye(3)).max() > 1e-3 or np.linalg.det(r) < 0:  # real files are rounded

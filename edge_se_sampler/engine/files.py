@@ -60,10 +60,11 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an (H, W, 3) float image in [0, 1] as PNG."""
+    """Write an image as PNG: (H, W, 3) floats in [0, 1], or (H, W) or (H, W, 3|4) of unsigned integers."""
     import imageio.v3 as iio  # slow to load: not for --help
 
-    write_atomically(path, iio.imwrite("<bytes>", to_uint8(image), extension=".png"))
+    pixels = image if image.dtype.kind == "u" else to_uint8(image)
+    write_atomically(path, iio.imwrite("<bytes>", pixels, extension=".png"))
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

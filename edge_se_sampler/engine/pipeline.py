@@ -16,6 +16,7 @@ from edge_se_sampler.models.config import Model, ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.depths import find_depths
+from edge_se_sampler.occupancy.hull import Hull
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -32,16 +33,18 @@ class Pipeline:
     """A RayModel."""
     data_summary: str = ""
     """What the training views are, in a line."""
+    hull: Hull | None = None
+    """The cells with which training begins; None: the model has no grid."""
 
     @classmethod
     def build(cls, config: TrainerConfig, views: Views, device: str, saved_grid: BrickGrid | None = None) -> Pipeline:
         """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own. InputError
         if the checkpoint's grid is another scene's."""
         model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
-        grid, has_masks, summary = saved_grid, False, views.describe()
+        grid, hull, has_masks, summary = saved_grid, None, False, views.describe()
         if model_config.needs_grid:
             analysis = analyze_views(views, model_config)
-            grid = analysis.grid()
+            grid, hull = analysis.grid(), analysis.hull
             has_masks = analysis.num_silhouettes > 0
             if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
                 changed = "its images, masks or cameras have changed since, or this machine rounds differently"
@@ -53,7 +56,7 @@ class Pipeline:
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
         datamanager = manager_config.setup(views=views, device=device, background_color=background)
-        return cls(datamanager, build_model(config, device, saved_grid or grid), summary)
+        return cls(datamanager, build_model(config, device, saved_grid or grid), summary, hull)
 
 
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:

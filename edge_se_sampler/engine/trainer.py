@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +52,8 @@ class Trainer:
         self.elapsed = 0.0
         self.events = EventWriter(run.path)
         self.stop_requested = False
+        self.turns: AbstractContextManager[Any] = nullcontext()
+        """Held while the model is used: a viewer, which has others wait for their turn, renders in between."""
         attributes = TrainingCallbackAttributes(pipeline, self)
         self.callbacks = pipeline.datamanager.get_training_callbacks(attributes)
         self.callbacks += pipeline.model.get_training_callbacks(attributes)
@@ -94,7 +96,8 @@ class Trainer:
             while self.next_step != plan.num_steps:
                 step = self.next_step
                 learning_rate = float(self.scheduler.get_last_lr()[0])
-                loss = self.train_iteration(step)
+                with self.turns:
+                    loss = self.train_iteration(step)
                 self.next_step, self.elapsed = step + 1, time.monotonic() - began
                 plan.decide(self.next_step, self.setup_seconds + self.elapsed)
                 ended = self.next_step == plan.num_steps
@@ -103,7 +106,8 @@ class Trainer:
                     strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
                     self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
                 if ended or self._preview_is_due():
-                    self._preview(step)
+                    with self.turns:
+                        self._preview(step)
                     began = time.monotonic() - self.elapsed  # a preview is not training time
                 if stop or self.next_step % config.steps_per_save == 0:
                     self.save()

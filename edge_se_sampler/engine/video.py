@@ -1,69 +1,88 @@
-"""A run rendered as a GIF or an MP4."""
+"""A run rendered as a GIF, an MP4, or a folder of frames."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+import itertools
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, BinaryIO
 
-import imageio.v3 as iio
 import numpy as np
 import torch
+from PIL import Image
 
+from edge_se_sampler.data.camera_path import read_camera_path
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
+from edge_se_sampler.engine.files import check_output, write_atomically
+from edge_se_sampler.engine.frames import FRAMES_ONLY, choose_depth_unit, render_frame, write_frames
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import render_rays
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_test_views, read_train_views
+from edge_se_sampler.engine.trajectories import spiral, through
 from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.models.ray_model import RayModel
 
-
-def spiral(like: Cameras, count: int) -> Cameras:
-    """Cameras once around the origin at the median distance of `like`, rising and falling between 15 and 45 degrees,
-    with the first one's intrinsics and size."""
-    radius = float(like.camera_to_worlds[:, :, 3].norm(dim=1).median())
-    azimuth = torch.arange(count).to(like.fx) / count * 2 * math.pi
-    elevation = math.radians(30) + math.radians(15) * torch.sin(2 * azimuth)
-    horizontal = elevation.cos()
-    back = torch.stack((horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()), dim=1)  # unit vectors
-    right = torch.stack((-azimuth.sin(), azimuth.cos(), torch.zeros_like(azimuth)), dim=1)
-    poses = torch.stack((right, torch.linalg.cross(back, right), back, back * radius), dim=2)
-    return replace(like[[0] * count], camera_to_worlds=poses)
+FRAMES_PER_SECOND = 20
 
 
 def render_run(
-    run: RunFolder, config: TrainerConfig, output_path: Path, kind: str, num_frames: int, frames_per_second: int
+    run: RunFolder,
+    config: TrainerConfig,
+    output_path: Path,
+    outputs: Sequence[str],
+    *,
+    kind: str | None = None,
+    camera_path: Path | None = None,
+    num_frames: int = 60,
+    frames_per_second: float | None = None,
+    depth_unit: float | None = None,
 ) -> None:
-    """Render a run's last checkpoint along a spiral or at its held-out cameras (kind "test"), as a video."""
-    check_video(output_path, frames_per_second)
+    """Render a run's last checkpoint at the cameras of a kind (see `find_cameras`) or of a camera path file, as a video
+    of the outputs (see `render_frame`) side by side, or as a folder of frames. InputError for what cannot be used."""
+    if kind is not None and camera_path is not None:
+        raise InputError("--kind and --camera-path: give one of them")
     check_value("num-frames", num_frames, num_frames >= 1, "at least 1")
-    check_value("frames-per-second", frames_per_second, frames_per_second >= 1, "at least 1")
-    model, _ = load_model(run, config)
-    if kind == "spiral":
-        cameras = spiral(read_train_views(config).cameras, num_frames)
+    check_value("outputs", outputs, len(outputs) == len(set(outputs)) > 0, "at least one, each once")
+    path = None if camera_path is None else read_camera_path(camera_path)
+    rates = (frames_per_second, path and path.frames_per_second, FRAMES_PER_SECOND)
+    rate = next(rate for rate in rates if rate is not None)
+    if output_path.suffix:
+        check_video(output_path, outputs, rate)
+    unit = choose_depth_unit(config.pipeline.model.depths[1], depth_unit)
+    model, checkpoint = load_model(run, config)
+    cameras = find_cameras(config, kind or "spiral", num_frames) if path is None else path.cameras
+    if output_path.suffix:
+        write_video(output_path, _video_frames(model, cameras, outputs, unit), rate)
     else:
-        cameras = read_test_views(config).cameras
-    (height, width), *others = torch.unique(torch.cat((cameras.height, cameras.width), dim=1), dim=0).tolist()
-    if others:
-        raise InputError("the held-out views differ in size and make no video; use --kind spiral")
-    cameras, frames = cameras.to(model.device, torch.float32), []
-    with Progress(len(cameras), "rendering") as progress:
-        for i in range(len(cameras)):
-            frames.append(render_rays(model, cameras.image_rays(i)).reshape(height, width, 3).numpy())
-            progress.update(i + 1)
-    write_video(output_path, frames, frames_per_second)
+        write_frames(output_path, model, cameras, outputs, unit, checkpoint)
 
 
-def check_video(path: Path, frames_per_second: int) -> None:
-    """InputError if `write_video` cannot write such a file."""
+def find_cameras(config: TrainerConfig, kind: str, num_frames: int) -> Cameras:
+    """Cameras of a run: its training views ("train") or held-out ones ("test") as they are, a path through the training
+    views in their order ("interpolate"), or a turn around what they look at ("spiral")."""
+    if kind == "test":
+        return read_test_views(config).cameras
+    views = read_train_views(config)
+    if kind == "train":
+        return views.cameras
+    trajectory = spiral if kind == "spiral" else through
+    return trajectory(views, config.pipeline.model.depths, num_frames)
+
+
+def check_video(path: Path, outputs: Sequence[str], frames_per_second: float) -> None:
+    """InputError if no such file can be written, or it cannot show such outputs."""
     suffix = path.suffix.lower()
-    if suffix == ".gif" and frames_per_second > 50:
-        raise InputError(f"--frames-per-second is {frames_per_second}: a GIF has at most 50; use .mp4")
     if suffix not in (".gif", ".mp4"):
-        raise InputError(f"--output-path {path}: must end in .gif or .mp4")
+        raise InputError(f"--output-path {path}: must end in .gif or .mp4, or have no ending: a folder of PNGs")
+    for name in FRAMES_ONLY.keys() & set(outputs):
+        raise InputError(f"--outputs {name} {FRAMES_ONLY[name]}: give --output-path a folder (no ending), not a video")
+    most = 50 if suffix == ".gif" else 1000
+    valid = 1 <= frames_per_second <= most
+    check_value("frames-per-second", f"{frames_per_second:g}", valid, f"from 1 to {most} in a {suffix[1:]}")
     check_output(path)
     if suffix == ".mp4":
         try:
@@ -72,15 +91,46 @@ def check_video(path: Path, frames_per_second: int) -> None:
             raise InputError("mp4 needs the [video] extra: pip install 'edge-se-sampler[video]', or use .gif") from None
 
 
-def write_video(path: Path, frames: list[np.ndarray], frames_per_second: int) -> None:
-    """Write (H, W, 3) float frames in [0, 1]; a GIF shows each for the nearest number of hundredths of a second.
-    InputError if it cannot be written."""
-    stacked, suffix = to_uint8(np.stack(frames)), path.suffix.lower()
-    if suffix == ".gif":
-        settings: dict[str, Any] = {"duration": 10 * round(100 / frames_per_second), "loop": 0}
-    else:
-        if min(stacked.shape[1:3]) < 2:
-            raise InputError(f"{path}: the views are 1 pixel wide or high, which is no video")
-        stacked = stacked[:, : stacked.shape[1] // 2 * 2, : stacked.shape[2] // 2 * 2]  # the codec needs even sides
-        settings = {"fps": frames_per_second, "macro_block_size": 2}
-    write_atomically(path, iio.imwrite("<bytes>", stacked, extension=suffix, **settings))
+def _video_frames(model: RayModel, cameras: Cameras, outputs: Sequence[str], unit: float) -> Iterator[np.ndarray]:
+    """(H, W, 3) uint8 frames, one after another, of outputs side by side. InputError if they differ in size."""
+    (height, width), *others = torch.unique(torch.cat((cameras.height, cameras.width), dim=1), dim=0).tolist()
+    if others:
+        raise InputError("the views differ in size and make no video; give --output-path a folder (no ending)")
+    if min(height, width) < 2:
+        raise InputError("the views are 1 pixel wide or high, which is no video")
+    with Progress(len(cameras), "rendering") as progress:
+        for i in range(len(cameras)):
+            images = render_frame(model, cameras, i, outputs, unit)
+            channels = (np.broadcast_to(np.atleast_3d(images[name]), (height, width, 3)) for name in outputs)
+            yield np.concatenate(list(channels), axis=1)
+            progress.update(i + 1)
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:
+    """Write at least one (H, W, 3) uint8 frame, none kept as it is; a GIF shows each for the nearest number of
+    hundredths of a second. InputError if it cannot be written."""
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    write_atomically(path, lambda file: write(file, iter(frames), frames_per_second))
+
+
+def _write_gif(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: float) -> None:
+    images = map(Image.fromarray, frames)
+    shown = {"duration": 10 * round(100 / frames_per_second), "loop": 0}
+    next(images).save(file, "GIF", save_all=True, append_images=images, **shown)
+
+
+def _write_mp4(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: float) -> None:
+    import imageio_ffmpeg
+
+    first = next(frames)
+    height, width = (side // 2 * 2 for side in first.shape[:2])  # the codec needs even sides
+    with TemporaryDirectory() as folder:
+        video = Path(folder) / "video.mp4"
+        rate: Any = frames_per_second  # typed as an integer; ffmpeg takes any
+        writing = imageio_ffmpeg.write_frames(str(video), (width, height), fps=rate, macro_block_size=2)
+        with closing(writing) as writer:
+            writer.send(None)
+            for frame in itertools.chain([first], frames):
+                writer.send(np.ascontiguousarray(frame[:height, :width]))
+        with open(video, "rb") as written:
+            shutil.copyfileobj(written, file)

@@ -1,0 +1,64 @@
+"""Camera paths as nerfstudio's viewer writes them (1.1.5: camera_path.json)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
+from edge_se_sampler.data.transforms_frames import rigid_pose
+
+MAX_SIDE = 8192  # pixels
+FIELDS_OF_VIEW = 0.1, 179.0  # degrees
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    cameras: Cameras
+    frames_per_second: float | None  # None: the file does not say
+
+
+def read_camera_path(path: Path) -> CameraPath:
+    """The cameras of a path, in the world that the file means, and its frame rate. A camera's fov is the vertical field
+    of view in degrees, its matrix is camera to world, row by row. InputError for what cannot be used."""
+    top = read_json(path)
+    kind = top.optional("camera_type")
+    if kind is not None and str(kind.value).lower() != "perspective":
+        raise kind.location.error(f"is {quote(kind.value)}, which cannot be rendered", 'make it "perspective"')
+    height, width = (_read_side(top, key) for key in ("render_height", "render_width"))
+    fps = top.optional("fps")
+    listed = top.required("camera_path", "list each camera as {camera_to_world, fov}")
+    if not listed.list():
+        raise listed.location.error("is empty", "add keyframes in the viewer, and save the path again")
+    poses = np.stack([_read_pose(camera) for camera in listed.list()])
+    focal = [height / 2 / math.tan(_read_angle(camera) / 2) for camera in listed.list()]
+    centered = {"cx": width / 2, "cy": height / 2, "width": width, "height": height}
+    cameras = Cameras.of(poses, fx=focal, fy=focal, **centered)
+    return CameraPath(cameras, None if fps is None else fps.positive_number())
+
+
+def _read_side(top: JsonValue, key: str) -> int:
+    side = top.required(key, "write the pixels of a frame's side")
+    if side.count() > MAX_SIDE:
+        raise side.location.error(f"is {quote(side.value)} pixels", f"write at most {MAX_SIDE}")
+    return side.count()
+
+
+def _read_pose(camera: JsonValue) -> np.ndarray:
+    hint = "write the 16 numbers of the 4x4 camera-to-world matrix, row by row"
+    matrix = camera.required("camera_to_world", hint)
+    if len(matrix.list()) != 16:
+        raise matrix.location.error(f"has {len(matrix.list())} entries", hint)
+    return rigid_pose(matrix, matrix.list())
+
+
+def _read_angle(camera: JsonValue) -> float:
+    """The vertical field of view, radians."""
+    angle, (least, most) = camera.required("fov", "write the vertical field of view in degrees"), FIELDS_OF_VIEW
+    if not least <= angle.number() <= most:
+        raise angle.location.error(f"is {quote(angle.value)}", f"write degrees, between {least:g} and {most:g}")
+    return math.radians(angle.number())

@@ -1,0 +1,82 @@
+"""The images and cameras of a run's data as nerfstudio's transforms.json."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_se_sampler.data.capture import SPLITS
+from edge_se_sampler.data.dataset import DataSettings, list_frames
+from edge_se_sampler.data.frames import Frame
+from edge_se_sampler.data.transforms import transforms_path
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import check_output, write_json
+from edge_se_sampler.engine.session import select_views
+from edge_se_sampler.errors import InputError
+
+POINTS_NAME = "points.ply"
+
+
+def export_cameras(config: TrainerConfig, path: Path) -> str:
+    """Write the cameras of a run's data, of the images as they are in their files: at full size, with their lenses'
+    distortion. Which are trained on is listed, and which are held out. Returns a line about it; InputError if the data
+    or the file cannot be used."""
+    if path.suffix.lower() != ".json":
+        raise InputError(f"--output-path {path}: must end in .json")
+    check_output(path)
+    assert config.data is not None  # the config is resolved
+    if path.resolve() == transforms_path(config.data).resolve() and config.data_format == "transforms":
+        raise InputError(f"--output-path {path}: the data itself, which is not overwritten; give another file")
+    settings = DataSettings(config.data_format, eval_every=config.eval_every)
+    splits = {split: list_frames(config.data, split, settings) for split in SPLITS}
+    selected = select_views(config, len(splits["train"]))
+    splits["train"] = splits["train"] if selected is None else [splits["train"][i] for i in selected]
+    # nerfstudio wants both
+    splits["val"], splits["test"] = splits["val"] or splits["test"], splits["test"] or splits["val"]
+    frames = {frame.image.path: describe_frame(frame, path.parent) for split in SPLITS for frame in splits[split]}
+    content = share_intrinsics(list(frames.values()))
+    for split in SPLITS:
+        if splits[split]:
+            content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
+    if (path.parent / POINTS_NAME).is_file():
+        content["ply_file_path"] = POINTS_NAME
+    write_json(path, content)
+    return f"{path}: {len(frames)} cameras, {len(splits['train'])} of them to train on"
+
+
+def describe_frame(frame: Frame, folder: Path) -> dict[str, Any]:
+    """A member of `frames`, with files relative to a folder."""
+    camera, lens = frame.camera, frame.camera.lens
+    pose = np.vstack((frame.pose, (0, 0, 0, 1)))
+    entry: dict[str, Any] = {"file_path": relative_path(frame.image.path, folder), "transform_matrix": pose.tolist()}
+    if frame.mask is not None:
+        entry["mask_path"] = relative_path(frame.mask.path, folder)
+    entry |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    entry |= {"w": frame.header.width, "h": frame.header.height, "camera_model": "OPENCV"}
+    if lens is not None:
+        names = ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2", "p1", "p2", "k3")
+        entry |= dict(zip(names, lens.coefficients, strict=True))
+        entry["camera_model"] = "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"
+    return entry
+
+
+def relative_path(file: Path, folder: Path) -> str:
+    """A file's path relative to a folder; as it is, where they are on different drives."""
+    try:
+        return Path(os.path.relpath(file, folder.resolve())).as_posix()
+    except ValueError:
+        return file.as_posix()
+
+
+def share_intrinsics(frames: list[dict[str, Any]]) -> dict[str, Any]:
+    """The json of frames, with what is of the camera at its top if it is the same for all; the camera's model, which
+    nerfstudio reads there alone, even if nothing else is."""
+    own = {"file_path", "mask_path", "transform_matrix"}
+    cameras = [{key: value for key, value in frame.items() if key not in own} for frame in frames]
+    names = ["camera_model", *(key for key in cameras[0] if all(camera == cameras[0] for camera in cameras))]
+    shared = {key: cameras[0][key] for key in names if all(camera[key] == cameras[0][key] for camera in cameras)}
+    frames = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
+    return shared | {"frames": frames}

@@ -1,0 +1,109 @@
+"""A run's surface as a mesh with colors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import to_uint8, write_atomically
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import load_model
+from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
+from edge_se_sampler.export.surface import find_surface, keep_largest
+from edge_se_sampler.models.lean import LeanModel
+from edge_se_sampler.models.ray_model import RayModel
+
+RAYS_AT_ONCE = 2**16
+CELLS_BEFORE = 2
+"""How far outside the surface the rays begin that ask for its colors, in cells."""
+
+
+def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: float, keep_components: int) -> str:
+    """Write the surface at which a cell has that opacity across; returns a line about it. InputError if a value is out
+    of its range, the file cannot be written, or nothing is as opaque."""
+    check_value("opacity-threshold", opacity, 0 < opacity < 1, "above 0 and below 1")
+    check_value("keep-components", keep_components, keep_components >= 0, "at least 0")
+    check_export(path, ".ply", ".glb")
+    import trimesh
+
+    model, _ = load_model(run, config)
+    if not isinstance(model, LeanModel):
+        raise InputError(
+            f"{config.method_name} has no cells to make a mesh of; lean-nerf has, export points needs none"
+        )
+    vertices, triangles = find_surface(model, opacity)
+    if not len(triangles):
+        raise InputError(f"--opacity-threshold is {opacity}: nothing is as opaque; give less, or train for longer")
+    vertices, triangles = keep_largest(vertices, triangles, keep_components)
+    mesh = trimesh.Trimesh(vertices, triangles, process=False)
+    normals = np.array(mesh.vertex_normals)
+    colors = ask_colors(model, vertices, normals, CELLS_BEFORE * float(model.grid.cell_size))
+    if path.suffix.lower() == ".glb":
+        write_atomically(path, to_glb(vertices, normals, colors, triangles))
+    else:
+        write_ply(path, point_columns(vertices, normals) | color_columns(to_uint8(colors)), triangles)
+    closed = "watertight" if mesh.is_watertight else "not watertight"
+    return describe_file(path, f"{len(vertices):,} vertices, {len(triangles):,} faces, {closed}")
+
+
+def ask_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:
+    """Colors (n, 3) in [0, 1] of a surface: those of rays along its inward normals, which begin that far outside. For
+    training fits the colors of rays: at the surface itself, where these have little weight yet, the network's color may
+    be any."""
+    origins = torch.from_numpy(positions + normals * (before + model.config.depths[0]))
+    origins, directions = (x.to(model.device, model.dtype) for x in (origins, torch.from_numpy(-normals)))
+    metadata = {"directions_norm": torch.ones_like(origins[:, :1]), "pixel_axes": origins.new_zeros(len(origins), 2, 3)}
+    rays = RayBundle(origins, directions, torch.zeros_like(origins[:, :1], dtype=torch.int64), metadata)
+    colors = []
+    with Progress(len(rays), "asking for colors") as progress:
+        for start in range(0, len(rays), RAYS_AT_ONCE):
+            colors.append(render_opaque(model, rays[start : start + RAYS_AT_ONCE])[0])
+            progress.update(min(start + RAYS_AT_ONCE, len(rays)))
+    return torch.cat(colors).numpy()
+
+
+def render_opaque(model: RayModel, rays: RayBundle) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Of n rays, what they would show without the background behind: colors (n, 3) in [0, 1] and distances (n, 1),
+    world units, both means over what is seen; and the accumulated opacity (n, 1)."""
+    names = ("rgb_fine", "accumulation_fine", "depth_fine", "background")
+    rgb, opacity, depth, background = render_outputs(model, rays, names).values()
+    passing, far = 1 - opacity, model.config.depths[1] * rays.metadata["directions_norm"].cpu()
+    opaque = opacity.clamp(min=1e-6)
+    return ((rgb - passing * background) / opaque).clamp(0, 1), (depth - passing * far) / opaque, opacity
+
+
+def to_glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> bytes:
+    """A mesh as binary glTF 2.0, whose y is up and whose vertex colors are linear: its y is the data's z, its z minus
+    the data's y, and sRGB colors (n, 3) in [0, 1] are linearized, as floats: bytes are too coarse for dark ones. It is
+    shown unlit, for the scene's light is in its colors."""
+    from trimesh import Trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+
+    def turn(vectors: np.ndarray) -> np.ndarray:
+        return vectors[:, [0, 2, 1]] * (1, 1, -1)
+
+    def add_colors(tree: dict[str, Any]) -> None:
+        primitive = tree["meshes"][0]["primitives"][0]
+        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_color")
+        primitive["material"] = 0
+        tree["materials"] = [{"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}]
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+
+    mesh = Trimesh(
+        turn(vertices),
+        triangles,
+        vertex_normals=turn(normals),
+        vertex_attributes={"_color": linear.astype(np.float32)},
+        process=False,
+    )
+    return export_glb(mesh, include_normals=True, tree_postprocessor=add_colors)

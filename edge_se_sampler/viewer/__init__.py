@@ -1,0 +1,1 @@
+"""edge-se view: a run in the browser, by viser."""

@@ -1,0 +1,72 @@
+"""A run as one html file that needs no server: its surface as points, its cameras, and a turntable."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import viser.transforms as tf
+
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
+from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.viewer.address import ViewerConfig, check_viser
+from edge_se_sampler.viewer.camera_path import View
+from edge_se_sampler.viewer.server import set_initial_camera, start_server
+from edge_se_sampler.viewer.viewed import Viewed
+
+NUM_POINTS, RAYS_PER_LOOK, MAX_LOOKS = 100_000, 2**14, 64
+"""Rays are rendered, so many at once, until there are so many points at their ends."""
+TURN_SECONDS, TURN_STEPS = 12.0, 180
+"""Of the turntable."""
+
+
+def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
+    """Write a run as one html file; InputError for a bad run, data or output."""
+    check_viser()
+    check_output(path, "--html")
+    viewed = Viewed.load(run, config)
+    points, colors = surface_points(viewed)
+    with start_server(ViewerConfig(port=0)) as server:
+        focus, scale = set_initial_camera(server, viewed)
+        table = server.scene.add_frame("/turntable", show_axes=False, position=focus)
+        look: dict[str, Any] = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
+        size = scale / float(viewed.cameras.fy.max())  # of a pixel
+        server.scene.add_point_cloud("/turntable/points", points - focus, colors, point_size=size, **look)
+        for k in range(len(viewed.cameras)):
+            view = View.of_training(viewed.cameras, k)
+            view.pose[:, 3] -= focus
+            view.draw(server.scene, f"/turntable/{k}", scale, (60, 60, 60))
+        recording = server.get_scene_serializer()
+        for step in range(TURN_STEPS):
+            table.wxyz = tf.SO3.exp(viewed.up * 2 * math.pi * step / TURN_STEPS).wxyz
+            recording.insert_sleep(TURN_SECONDS / TURN_STEPS)
+        write_atomically(path, recording.as_html().encode())
+
+
+def surface_points(viewed: Viewed) -> tuple[np.ndarray, np.ndarray]:
+    """Points (m, 3), world units, and their colors (m, 3) uint8: where random rays of the training views see something
+    with an accumulation above a half."""
+    model, found = viewed.model, []
+    rng, far = stream(viewed.trainer.config.machine.seed, 0, Stream.PROBE), model.config.depths[1]
+    with Progress(NUM_POINTS, "looking for points") as progress:
+        for _ in range(MAX_LOOKS):
+            rays = viewed.trainer.pipeline.datamanager.probe_rays(RAYS_PER_LOOK, rng)
+            outputs = render_outputs(model, rays, ["rgb_fine", "accumulation_fine", "depth_fine"])
+            accumulation = outputs["accumulation_fine"]
+            behind = (1 - accumulation).to(rays.origins)  # at the far depth, in the background's color
+            depth = outputs["depth_fine"].to(behind) - behind * far * rays.metadata["directions_norm"]
+            position = (rays.origins + depth / (1 - behind) * rays.directions).cpu()
+            color = (outputs["rgb_fine"] - behind.cpu() * model.config.background_level) / accumulation
+            found.append(torch.cat((position, color), dim=1)[accumulation[:, 0] > 0.5])
+            progress.update(min(NUM_POINTS, count := sum(map(len, found))))
+            if count >= NUM_POINTS:
+                break
+    points = torch.cat(found).double().numpy()
+    return points[:, :3], to_uint8(points[:, 3:])

@@ -1,0 +1,167 @@
+"""A run that is looked at, finished or in training, and what there is to see of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from threading import Condition
+from typing import Any
+
+import numpy as np
+import torch
+
+from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import to_uint8
+from edge_se_sampler.engine.metrics import composite_on
+from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
+from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.session import choose_device, read_train_views
+from edge_se_sampler.engine.show import probability_map
+from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.sampling.edges import unit_float
+from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
+from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.sampling.ranking import error_ranks
+from edge_se_sampler.sampling.strategies import RankedError
+
+MAX_POINTS = 60_000
+"""Cells that are drawn; of more, so many at random."""
+
+
+class Turns:
+    """A lock that goes to who has waited longest: training, which asks again at once, must not keep it to itself."""
+
+    def __init__(self) -> None:
+        self._changed, self._next, self._current = Condition(), 0, 0
+
+    def __enter__(self) -> None:
+        with self._changed:
+            turn, self._next = self._next, self._next + 1
+            self._changed.wait_for(lambda: turn == self._current)
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._current += 1
+            self._changed.notify_all()
+
+
+class Viewed:
+    """A trainer whose model is shown. Whoever uses the model or the sampler does so in `turns`, as training does."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer = trainer
+        self.turns = trainer.turns = Turns()
+
+    @classmethod
+    def load(cls, run: RunFolder, config: TrainerConfig) -> Viewed:
+        """A run at its last checkpoint; nothing is written. InputError for a bad run or data."""
+        state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
+        device, views = choose_device(config.machine.device_type), read_train_views(config)
+        pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
+        load_weights(pipeline.model, state["model"])
+        viewed = cls(config.setup(run=run, pipeline=pipeline, preview=None))
+        viewed._take(state, pipeline.model)
+        return viewed
+
+    def reload(self) -> None:
+        """Show a newer checkpoint if another process has written one; InputError if it cannot be read."""
+        trainer = self.trainer
+        path = latest_checkpoint(trainer.run.checkpoints)
+        if path.stem != f"step-{trainer.next_step - 1:09d}":
+            state = load_checkpoint(path, config_digest(trainer.config))
+            model = build_model(trainer.config, str(trainer.pipeline.model.device), saved_grid(state["model"]))
+            load_weights(model, state["model"])
+            self._take(state, model)
+
+    def _take(self, state: dict[str, Any], model: Any) -> None:
+        """Show a checkpoint's model, and its sampler."""
+        trainer, manager = self.trainer, self.trainer.pipeline.datamanager
+        with self.turns:
+            trainer.pipeline, trainer.next_step = replace(trainer.pipeline, model=model), state["step"] + 1
+            manager.load_state_dict(state["sampler"])
+            if isinstance(manager.train_pixel_sampler, ImportantPixels):
+                manager.train_pixel_sampler.set_step(state["step"])
+
+    @property
+    def model(self) -> Any:
+        return self.trainer.pipeline.model
+
+    @property
+    def strategy(self) -> str | None:
+        """Name of the current strategy of drawing pixels; None: the pixel sampler is not one of ours."""
+        return getattr(self.trainer.pipeline.datamanager.train_pixel_sampler, "strategy", None)
+
+    @property
+    def cameras(self) -> Cameras:
+        """Those of the training views."""
+        return self.trainer.pipeline.datamanager.cameras
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit vector: what is above in most of them."""
+        up = self.cameras.camera_to_worlds[:, :, 1].double().cpu().numpy().mean(axis=0)
+        return up / max(float(np.linalg.norm(up)), 1e-9)
+
+    def image(self, k: int, stride: int = 1) -> np.ndarray:
+        """Every so many pixels, both ways, of the kth training image on the model's background, (H, W, 3) uint8."""
+        image = self.trainer.pipeline.datamanager.image_batch["image"][k][::stride, ::stride]
+        return to_uint8(composite_on(unit_float(image.numpy()), self.model.config.background_level))
+
+    def probability(self, k: int, squared_error: Callable[[], np.ndarray | None]) -> np.ndarray | None:
+        """Probability of every pixel of the kth view under the current strategy, relative to uniform, (H, W); where
+        squared errors rank the pixels, the cached ones do or else (H, W) rendered ones. None: the pixel sampler is not
+        one of ours, or there are no errors."""
+        manager = self.trainer.pipeline.datamanager
+        sampler = manager.train_pixel_sampler
+        if not isinstance(sampler, ImportantPixels):
+            return None
+        use_mask, background = not sampler.config.ignore_mask, sampler.background_color
+        batch = ImageBatch.of(manager.image_batch, use_mask=use_mask, background_color=background)
+        distribution, selector = sampler.strategies[sampler.strategy]
+        p = probability_map(distribution, batch, k)
+        if isinstance(selector, RankedError):
+            errors = self._cached_errors(selector, batch, k)
+            errors = squared_error() if errors is None else errors
+            if errors is None:
+                return None
+            p = p * error_ranks(errors.ravel(), stream(0, 0, Stream.SELECTION)).reshape(p.shape)
+        return p * p.size / max(p.sum(), 1e-30)
+
+    def _cached_errors(self, selector: RankedError, batch: ImageBatch, k: int) -> np.ndarray | None:
+        """(H, W) squared errors of the kth view that training remembers; None: it remembers none."""
+        number, (height, width) = int(batch.numbers[k]), batch.sizes[k]
+        count = self.trainer.pipeline.datamanager.train_pixel_sampler.num_rays_per_batch
+        with self.turns:
+            if selector.error_map is None or number not in selector.error_map.sizes:
+                return None
+            pixels = torch.cartesian_prod(torch.tensor([number]), torch.arange(height), torch.arange(width)).numpy()
+            return selector.error_map.lookup(pixels, self.trainer.next_step, count).reshape(height, width)
+
+    def occupied_cells(self) -> tuple[np.ndarray, float] | None:
+        """Centers (m, 3) of cells that are occupied now, world units, and the size of a cell; None: there are none."""
+        grid: BrickGrid | None = self.model.grid
+        if grid is None:
+            return None
+        with self.turns:
+            brick, cell = torch.nonzero(grid.occupied, as_tuple=True)
+            within = torch.stack((cell // 16, cell // 4 % 4, cell % 4), dim=1)
+            centers = grid.aabb_min + (4 * grid.bricks[brick] + within + 0.5) * grid.cell_size
+        return _some(centers.cpu().numpy()), float(grid.cell_size)
+
+    def hull_cells(self) -> tuple[np.ndarray, float] | None:
+        """As `occupied_cells`, of those with which training began."""
+        hull = self.trainer.pipeline.hull
+        if hull is None:
+            return None
+        return _some(hull.aabb_min + (np.argwhere(hull.cells) + 0.5) * hull.cell_size), hull.cell_size
+
+
+def _some(points: np.ndarray) -> np.ndarray:
+    """At most MAX_POINTS of points (m, 3), at random."""
+    if len(points) <= MAX_POINTS:
+        return points
+    return points[stream(0, 0, Stream.PROBE).choice(len(points), MAX_POINTS, replace=False)]

@@ -1,0 +1,156 @@
+"""Cameras as nerfstudio's transforms.json: read back by our own reader, they are the data's."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from blender_folder import write_json, write_scene
+from capture_folder import (
+    COUNT,
+    FISHEYE,
+    HEIGHT,
+    NAMES,
+    OPENCV,
+    PINHOLE,
+    Distortion,
+    read,
+    transforms,
+    write_colmap,
+    write_transforms,
+)
+from exported import ball_run
+
+from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.export.cameras import export_cameras
+from edge_se_sampler.methods import method_configs
+
+
+def config_of(data: Path, data_format: Any, **changes: Any) -> TrainerConfig:
+    return replace(method_configs()["lean-nerf"], data=data, data_format=data_format, **changes)
+
+
+def assert_same(views: Views, expected: Views) -> None:
+    """The same images, seen along the same rays, in any order."""
+    order = [sorted(range(len(v.names)), key=lambda i: v.images[i].tobytes()) for v in (views, expected)]
+    assert len(order[0]) == len(order[1])
+    for i, j in zip(*order, strict=True):
+        np.testing.assert_array_equal(views.images[i], expected.images[j])
+        rays, wanted = views.cameras.image_rays(i), expected.cameras.image_rays(j)
+        np.testing.assert_allclose(rays.origins, wanted.origins, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(rays.directions, wanted.directions, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("distortion", [PINHOLE, OPENCV, FISHEYE], ids=lambda each: each.model)
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_what_is_read_back_has_the_rays_of_the_data(distortion: Distortion, downscale: int, tmp_path: Path) -> None:
+    write_colmap(tmp_path, distortion)
+    config = config_of(tmp_path, "colmap", eval_every=4, downscale=downscale)
+    export_cameras(config, tmp_path / "transforms.json")
+    for split in ("train", "test"):
+        expected = read(tmp_path, split, data_format="colmap", eval_every=4, downscale=downscale)
+        assert_same(read(tmp_path, split, data_format="transforms", downscale=downscale), expected)
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    assert len(document["frames"]) == COUNT
+    assert document["train_filenames"] == [f"images/{NAMES[i]}" for i in (1, 2, 3, 5, 6, 7)]
+    assert document["val_filenames"] == document["test_filenames"] == [f"images/{NAMES[i]}" for i in (0, 4, 8)]
+    assert document["camera_model"] == ("OPENCV_FISHEYE" if distortion is FISHEYE else "OPENCV")
+    assert document["h"] == HEIGHT  # of the file, which is not downscaled
+    assert set(document["frames"][0]) == {"file_path", "transform_matrix"}
+
+
+def test_a_blender_scene_becomes_one_file(tmp_path: Path) -> None:
+    for split in ("train", "val", "test"):
+        write_scene(tmp_path, 3, split)
+        for i in range(3):  # images of their own
+            iio.imwrite(tmp_path / split / f"r_{i}.png", np.full((4, 6, 4), 20 * i + len(split), np.uint8))
+    export_cameras(config_of(tmp_path, "blender"), tmp_path / "transforms.json")
+    for split in ("train", "val", "test"):
+        expected = read(tmp_path, split, data_format="blender")
+        assert_same(read(tmp_path, split, data_format="transforms"), expected)
+
+
+@pytest.mark.parametrize("held_out", ["val", "test"])
+def test_the_one_list_of_held_out_views_is_both(held_out: str, tmp_path: Path) -> None:
+    """nerfstudio measures on val while it trains and on test afterwards, and stops where a list is missing."""
+    for split in ("train", held_out):
+        write_scene(tmp_path, 2, split)
+    export_cameras(config_of(tmp_path, "blender"), tmp_path / "transforms.json")
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    expected = [f"{held_out}/r_0.png", f"{held_out}/r_1.png"]
+    assert document["val_filenames"] == document["test_filenames"] == expected
+
+
+def test_cameras_that_differ_are_with_their_frames_and_masks_too(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    for i, frame in enumerate(document["frames"]):
+        frame["fl_x"] = 40 + i
+    iio.imwrite(tmp_path / "mask.png", np.eye(HEIGHT, document["w"], dtype=np.uint8))
+    document["frames"][2]["mask_path"] = "mask.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    export_cameras(config_of(tmp_path, "transforms", eval_every=3), tmp_path / "cameras.json")
+    (written := tmp_path / "cameras.json").rename(tmp_path / "transforms.json")
+    assert not written.exists()
+    exported = json.loads((tmp_path / "transforms.json").read_text())
+    assert exported["camera_model"] == "OPENCV"
+    assert "fl_x" not in exported
+    assert "h" in exported["frames"][0]  # all or none: nerfstudio takes what is at the top for all
+    views = read(tmp_path, "train")
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    expected = read(tmp_path, "train", eval_every=3)
+    assert_same(views, expected)
+    assert views.masks is not None
+    assert expected.masks is not None
+    assert sorted(mask.sum() for mask in views.masks) == sorted(mask.sum() for mask in expected.masks)
+
+
+def test_files_are_relative_to_the_json_and_points_beside_it_are_named(tmp_path: Path, edge_se: Callable) -> None:
+    run, out = ball_run(tmp_path), tmp_path / "elsewhere" / "deep"
+    out.mkdir(parents=True)
+    cameras = ("export", run, "cameras", "--output-path", out / "transforms.json")
+    answer = edge_se(*cameras)
+    assert answer.code == 0, answer.err
+    assert "6 cameras" in answer.out
+    document = json.loads((out / "transforms.json").read_text())
+    assert "ply_file_path" not in document
+    assert document["frames"][0]["file_path"] == "../../scene/0.png"
+    assert all(
+        (out / frame["file_path"]).samefile(tmp_path / "scene" / f"{i}.png")
+        for i, frame in enumerate(document["frames"])
+    )
+    assert edge_se("export", run, "points", "--output-path", out / "points.ply", "--num-points", 99).code == 0
+    assert edge_se(*cameras).code == 0
+    assert json.loads((out / "transforms.json").read_text())["ply_file_path"] == "points.ply"
+
+
+def test_the_views_that_were_trained_on_are_listed(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    export_cameras(config_of(tmp_path, "transforms", eval_every=3, views=(4, 1)), tmp_path / "cameras.json")
+    document = json.loads((tmp_path / "cameras.json").read_text())
+    train = [i for i in range(COUNT) if i % 3]
+    assert document["train_filenames"] == [f"images/{NAMES[train[i]]}" for i in (4, 1)]
+    assert len(document["frames"]) == 2 + 3
+
+
+def test_the_datas_own_json_is_not_overwritten(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    with pytest.raises(InputError, match="not overwritten"):
+        export_cameras(config_of(tmp_path, "transforms"), tmp_path / "images" / ".." / "transforms.json")
+    assert json.loads((tmp_path / "transforms.json").read_text()) == transforms()
+
+
+def test_data_that_is_gone_is_an_error(tmp_path: Path, edge_se: Callable) -> None:
+    run = ball_run(tmp_path)
+    write_json(tmp_path / "scene", {"fl_x": 9, "frames": []})
+    answer = edge_se("export", run, "cameras", "--output-path", tmp_path / "transforms.json")
+    assert answer.code == 2
+    assert "frames" in answer.err
+    assert not (tmp_path / "transforms.json").exists()
