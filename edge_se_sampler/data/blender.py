@@ -29,7 +29,7 @@ def read_blender(
     progress: Progress = lambda done, total: None,
 ) -> Views:
     """Read one split of a scene; files that no frame lists are ignored. Poses are returned as written (not moved,
-    scaled or orthonormalized). A frame without mask_path is trained on as a whole. InputError for anything that cannot
+    scaled or orthonormalized). A frame without mask_path or a file for it in `masks` is trained on as a whole. InputError for anything that cannot
     be used: first of the folder, then of the json, then of the images."""
     frames, top = list_frames(Path(folder), split)
     views = load_views(frames, settings, progress)
