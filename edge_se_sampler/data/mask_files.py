@@ -9,9 +9,9 @@ from edge_se_sampler.data.scene_file import SourceFile, locate_file
 
 
 def place_of_mask(folder: Path, image: Path) -> Path:
-    """Where the mask of an image in the folder of a scene lies, as COLMAP has it: in `masks` for `images`, `masks_2` for
-    `images_2` and so on, else under `masks`; with .png added to the image's name. ValueError: the image lies outside the
-    folder."""
+    """Where the mask of an image in the folder of a scene lies, as COLMAP has it: in `masks` for `images`, `masks_2`
+    for `images_2` and so on, else under `masks`; with .png added to the image's name. ValueError: the image lies
+    outside the folder."""
     parts = image.relative_to(os.path.realpath(folder)).parts
     if len(parts) > 1 and parts[0].split("_")[0] == "images":
         parts = parts[0].replace("images", "masks"), *parts[1:]
@@ -22,8 +22,8 @@ def place_of_mask(folder: Path, image: Path) -> Path:
 
 
 def find_mask(folder: Path, image: SourceFile) -> SourceFile | None:
-    """The mask of an image for which the scene lists none; None: there is none either. InputError if it lies outside the
-    folder."""
+    """The mask of an image for which the scene lists none; None: there is none either. InputError if it lies outside
+    the folder."""
     if not image.path.is_relative_to(os.path.realpath(folder)):
         return None
     place = place_of_mask(folder, image.path)

@@ -85,9 +85,9 @@ def _measure(image: np.ndarray, bins: np.ndarray, border: np.ndarray, typical: n
 
 def _fit_surface(terms: np.ndarray, colors: np.ndarray, seeds: np.ndarray) -> np.ndarray:
     """The distances (H, W) of all pixels, of terms (H, W, 6) and colors (H, W, 3), from the surface that grows from the
-    seeds, (H, W) bool: what a step explains, the next is fitted to. They are infinite if it is not
-    plain."""
+    seeds, (H, W) bool: what a step explains, the next is fitted to. They are infinite if it is not plain."""
     rng, explained = np.random.default_rng(0), seeds
+    distance, deviation = np.full(seeds.shape, np.inf, dtype=np.float32), np.zeros(3)
     for count in COEFFICIENTS:
         a, b = terms[explained][:, :count], colors[explained]
         rows = rng.choice(len(a), min(SAMPLES, len(a)), replace=False)

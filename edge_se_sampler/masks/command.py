@@ -32,8 +32,12 @@ OUTLINE = (230, 40, 40)
 
 
 def make_masks(folder: Path, settings: DataSettings, picture: Path) -> str:
-    """Write a mask for each image of a folder, 255 on the object, and the picture; returns lines about them. InputError:
-    too few images, some have masks or alpha already, in none is there an object, or masks cannot be written."""
+    """Write a mask for each image of a folder, 255 on the object, and the picture; returns lines about them.
+
+    Raises:
+        InputError: too few images, some have masks or alpha already, in none is there an object, or masks cannot be
+            written.
+    """
     check_output(picture)
     frames = _frames(folder, settings)
     places = [_place(folder, frame) for frame in frames]

@@ -56,14 +56,16 @@ def _cut(image: np.ndarray, distance: np.ndarray, mask: np.ndarray, votes: np.nd
     if foreground.all() or not foreground.any():
         return foreground > 0
     cv2.setRNGSeed(0)  # of this thread
-    models = np.zeros((2, 1, 65))
-    cv2.grabCut(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), labels, None, *models, 1, cv2.GC_INIT_WITH_MASK)
+    background, object_ = np.zeros((2, 1, 65))
+    # typed as if the rectangle, which a mask replaces, could not be left out
+    cv2.grabCut(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), labels, None, background, object_, 1, cv2.GC_INIT_WITH_MASK)  # pyright: ignore
     return (labels & 1) > 0
 
 
 def _fill(mask: np.ndarray, votes: np.ndarray) -> np.ndarray:
     """The mask (H, W) with those of its holes that the other views show to be of the object."""
     count, holes = cv2.connectedComponents((~mask).astype(np.uint8), connectivity=4)
+    holes = np.asarray(holes, dtype=np.int64)
     share = np.bincount(holes.ravel(), votes.ravel(), count) / np.bincount(holes.ravel(), minlength=count).clip(min=1)
     share[np.concatenate((holes[0], holes[-1], holes[:, 0], holes[:, -1]))] = 0  # open to the border
     return mask | (~mask & (share >= SOLID)[holes])

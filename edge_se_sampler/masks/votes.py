@@ -58,12 +58,13 @@ def count_votes(
             rows, pixels = _project(cameras, i, lenses[i], points)
             foreground[rows] += image[pixels]
             seen[rows] += 1
-        points, foreground, seen = (x[seen >= max(2, MIN_SEEN * len(masks))] for x in (points, foreground, seen))
+        often = seen >= max(2, MIN_SEEN * len(masks))
+        points, foreground, seen = points[torch.from_numpy(often)], foreground[often], seen[often]
         for i, image in enumerate(widened):
             rows, pixels = _project(cameras, i, lenses[i], points)
             share = (foreground[rows] - image[pixels].astype(np.float32)) / (seen[rows] - 1)
             votes[i] = _paint(votes[i], pixels, share, int(np.ceil(BLOCK * sizes[i])))
-        of_object = points[foreground >= MIN_OBJECT * seen].numpy()
+        of_object = points[torch.from_numpy(foreground >= MIN_OBJECT * seen)].numpy()
         if not len(of_object):
             break
         low, high = of_object.min(axis=0) - step, of_object.max(axis=0) + step
