@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from edge_se_sampler.data.config import DataFormat, Masks
+from edge_se_sampler.data.config import DataFormat
+from edge_se_sampler.data.config import Masks as MeaningOfMasks
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import check_value
 from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
@@ -237,7 +238,7 @@ class _Data:
     """A folder of images and their cameras, as in training."""
     data_format: DataFormat = "auto"
     """Format of the folder; auto: by what it has."""
-    masks: Masks = "ignore"
+    masks: MeaningOfMasks = "ignore"
     """What is outside of mask files: unknown (ignore), or background (object)."""
     eval_every: int | None = None
     """Every how many images one is left out, as held out in training; by default 8 where the data has no split."""
@@ -319,6 +320,24 @@ class Inspect(_Data):
         print(self.output_path)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Masks:
+    """Find the masks of an object in front of a plain background: a wall, a table, a turntable."""
+
+    data: Path
+    """Folder of images and cameras; the masks are written into it, as `masks/` or beside images_2 as `masks_2/`."""
+    data_format: DataFormat = "auto"
+    """Insist on a format where a folder has several."""
+    output_path: Path = Path("masks.png")
+    """The picture to write, to judge the masks by."""
+
+    def run(self) -> None:
+        from edge_se_sampler.data.dataset import DataSettings
+        from edge_se_sampler.masks.command import make_masks
+
+        print(make_masks(self.data, DataSettings(self.data_format), self.output_path))
+
+
 @dataclass(frozen=True)
 class Methods:
     """List every method and the package that registered it."""
@@ -333,7 +352,7 @@ class Bench:
     """Run the experiments and timings behind the published numbers."""
 
 
-_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, View, Show, Inspect, Methods, Bench)
+_COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, View, Show, Inspect, Masks, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
 
 

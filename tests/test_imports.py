@@ -22,7 +22,7 @@ LAYERS = [
     ("models",),
     ("engine",),
     ("methods",),
-    ("nerfstudio", "bench", "export", "viewer"),
+    ("nerfstudio", "bench", "export", "viewer", "masks"),
     ("commands",),
     ("cli",),
 ]

@@ -28,9 +28,9 @@ def read_blender(
     settings: LoadSettings = LoadSettings(),  # noqa: B008 (frozen)
     progress: Progress = lambda done, total: None,
 ) -> Views:
-    """Read one split of a scene; files that no frame lists are ignored. Poses are returned as written (not moved,
-    scaled or orthonormalized). A frame without mask_path is trained on as a whole. InputError for anything that cannot
-    be used: first of the folder, then of the json, then of the images."""
+    """Read one split of a scene; files that no frame lists are ignored, but for masks (`mask_files`). Poses are
+    returned as written (not moved, scaled or orthonormalized). A frame without a mask is trained on as a whole.
+    InputError for anything that cannot be used: first of the folder, then of the json, then of the images."""
     frames, top = list_frames(Path(folder), split)
     views = load_views(frames, settings, progress)
     # real scenes, whose units are their own, state focal lengths in pixels alone

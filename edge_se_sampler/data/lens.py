@@ -77,7 +77,7 @@ def _zoom(camera: Intrinsics, factor: float) -> Intrinsics:
 
 def _all_inside(camera: Intrinsics, pinhole: Intrinsics, width: int, height: int, x: np.ndarray, y: np.ndarray) -> bool:
     """Whether the image of a lens shows what a pinhole shows at pixels x, y (m,)."""
-    return bool(_locate(camera, pinhole, width, height, x[None], y[None])[1].all())
+    return bool(locate(camera, pinhole, width, height, x[None], y[None])[1].all())
 
 
 def find_sources(camera: Intrinsics, pinhole: Intrinsics, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -91,15 +91,15 @@ def find_sources(camera: Intrinsics, pinhole: Intrinsics, width: int, height: in
     for start in range(0, height, ROWS_AT_ONCE):  # in float64 all rows would take many times the image's memory
         rows = slice(start, min(start + ROWS_AT_ONCE, height))
         y = np.arange(rows.start, rows.stop)[:, None]
-        found, inside[rows] = _locate(camera, pinhole, width, height, np.arange(width)[None], y)
+        found, inside[rows] = locate(camera, pinhole, width, height, np.arange(width)[None], y)
         sources[:, rows] = np.where(inside[rows], found, 0)
     return sources, inside
 
 
-def _locate(
+def locate(
     camera: Intrinsics, pinhole: Intrinsics, width: int, height: int, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`find_sources` at pixels x, y, which broadcast to (H, W)."""
+    """`find_sources` at pixels x, y, whole numbers at their centers, which broadcast to (H, W)."""
     assert camera.lens is not None
     k = camera.lens.coefficients
     with np.errstate(all="ignore"):  # absurd coefficients overflow: no pixel is left then

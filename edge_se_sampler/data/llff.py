@@ -17,6 +17,7 @@ from edge_se_sampler.data.colmap import ROUNDING, find_images
 from edge_se_sampler.data.frames import Frame, choose_orientation, read_headers
 from edge_se_sampler.data.image_file import ImageHeader
 from edge_se_sampler.data.lens import Intrinsics
+from edge_se_sampler.data.mask_files import find_mask
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, locate_file
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -28,7 +29,7 @@ def bounds_path(folder: Path) -> Path:
 
 
 def read_llff(folder: Path) -> Capture:
-    """All images of a folder, in the order of their names, without masks; the depths that each sees count as points.
+    """All images of a folder, in the order of their names; the depths that each sees count as points.
     InputError for files that cannot be used, or if there is not one image for each pose."""
     rows, location = _read_rows(bounds_path(folder)), SourceLocation(bounds_path(folder))
     images = find_images(folder)
@@ -38,7 +39,7 @@ def read_llff(folder: Path) -> Capture:
         raise location.error(problem, "put the images there that the poses were found with, and no others")
     files = [locate_file(images, name, location.item(i)) for i, name in enumerate(names)]
     items = zip(files, read_headers(files), rows, strict=True)
-    frames = [_frame(file, header, row) for file, header, row in items]
+    frames = [_frame(folder, file, header, row) for file, header, row in items]
     points = [_points(frame.pose, row[15:]) for frame, row in zip(frames, rows, strict=True)]
     return Capture(frames, "", points=points)
 
@@ -74,7 +75,7 @@ def _check_row(row: np.ndarray, location: SourceLocation) -> None:
         raise location.error(f"its depths are {near:g} and {far:g}, not 0 < near < far", hint)
 
 
-def _frame(file: SourceFile, header: ImageHeader, row: np.ndarray) -> Frame:
+def _frame(folder: Path, file: SourceFile, header: ImageHeader, row: np.ndarray) -> Frame:
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
 
@@ -87,7 +88,7 @@ def _frame(file: SourceFile, header: ImageHeader, row: np.ndarray) -> Frame:
         raise file.error(problem, "use the images that the poses were found with, or scaled ones")
     pose = np.stack((matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]), axis=1)
     camera = Intrinsics(focal, focal, width / 2, height / 2).scaled(header.width / width, header.height / height)
-    return Frame(file.name, file, None, pose, header, camera)
+    return Frame(file.name, file, find_mask(folder, file), pose, header, camera)
 
 
 def _points(pose: np.ndarray, depths: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from edge_se_sampler.data.frames import Frame, choose_orientation, read_headers
 from edge_se_sampler.data.image_file import ImageHeader, read_image
 from edge_se_sampler.data.lens import Intrinsics, Lens
+from edge_se_sampler.data.mask_files import find_mask
 from edge_se_sampler.data.scene_file import (
     JsonValue,
     SourceFile,
@@ -103,11 +104,12 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
     own = _read_intrinsics(entry)
     # an angle of the frame's own says more than a focal length of the file's
     shared = {key: value for key, value in shared.items() if key.replace("fl_", "camera_angle_") not in own}
+    image = _locate(file_path, folder)
     return Entry(
         location=entry.location,
         file_path=file_path.file_path(),
-        image=_locate(file_path, folder),
-        mask=None if mask_path is None else _locate(mask_path, folder),
+        image=image,
+        mask=find_mask(folder, image) if mask_path is None else _locate(mask_path, folder),
         pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),
         intrinsics=shared | own,
     )
