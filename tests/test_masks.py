@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.dataset import DataSettings, read_split
-from edge_se_sampler.data.lens import Intrinsics
+from edge_se_sampler.data.lens import Intrinsics, Lens
 from edge_se_sampler.data.mask_files import place_of_mask
 from edge_se_sampler.masks.segmentation import segment
-from edge_se_sampler.masks.votes import count_votes
+from edge_se_sampler.masks.votes import count_votes, find_pixels
 
 SIZE, COUNT, FOCAL, DISTANCE = 120, 12, 150.0, 4.0
 LENS = Intrinsics(FOCAL, FOCAL, SIZE / 2, SIZE / 2)
@@ -78,6 +80,53 @@ def test_an_object_is_found_and_the_hole_through_it_stays_open(
     assert not any(mask[middle, middle] for mask in found)
 
 
+def test_a_hole_stays_open_where_compression_smears_colors(images: list[np.ndarray], truth: list[np.ndarray]) -> None:
+    """JPEG halves the resolution of colors: at its edges the wall takes on those of the object."""
+    encoded = [iio.imwrite("<bytes>", image, extension=".jpg", quality=95, subsampling=2) for image in images]
+    found = segment([iio.imread(image) for image in encoded], [LENS] * COUNT, poses())
+    assert not any(mask[SIZE // 2, SIZE // 2] for mask in found)
+    assert min(map(iou, found, truth)) > 0.95
+
+
+def unplain(rng: np.random.Generator) -> np.ndarray:
+    """(SIZE, SIZE, 3) uint8: patches of all colors."""
+    return rng.integers(0, 256, (SIZE // 10, SIZE // 10, 3), dtype=np.uint8).repeat(10, axis=0).repeat(10, axis=1)
+
+
+def test_the_other_views_make_the_mask_of_one_without_a_plain_background(
+    images: list[np.ndarray], truth: list[np.ndarray]
+) -> None:
+    some = [unplain(np.random.default_rng(2)) if i == 4 else image for i, image in enumerate(images)]
+    found = segment(some, [LENS] * COUNT, poses())
+    assert iou(found[4], truth[4]) > 0.8
+    assert min(iou(found[i], truth[i]) for i in range(COUNT) if i != 4) > 0.95
+
+
+def test_a_wall_and_a_table_are_background(images: list[np.ndarray], truth: list[np.ndarray]) -> None:
+    rng = np.random.default_rng(3)
+    some = [image.copy() for image in images]
+    for image, mask in zip(some, truth, strict=True):
+        table = (110 + rng.normal(0, 3, (SIZE // 3, SIZE, 3))).astype(np.uint8)
+        image[-len(table) :] = np.where(mask[-len(table) :, :, None], image[-len(table) :], table)
+    assert min(map(iou, segment(some, [LENS] * COUNT, poses()), truth)) > 0.95
+
+
+def test_a_lens_that_distorts_is_heeded(truth: list[np.ndarray]) -> None:
+    """A view's rays pass where its lens shows them: at the border, far from where a pinhole would."""
+    lens = replace(LENS, lens=Lens(fisheye=False, coefficients=(-0.3, 0, 0, 0, 0)))
+    radius = 0.37  # of the ring's outermost point in a pinhole's image, in units of depth
+    coords = torch.tensor([SIZE / 2, SIZE / 2 + FOCAL * radius * (1 - 0.3 * radius**2)])
+    pose = poses()[0]
+    point = pose[:, 3] + DISTANCE * (radius * pose[:, 0] - pose[:, 2])
+    cameras = Cameras.of(pose[None], fx=FOCAL, fy=FOCAL, cx=SIZE / 2, cy=SIZE / 2, width=SIZE, height=SIZE).to(
+        dtype=torch.float32
+    )
+    rows, pixels = find_pixels(cameras, 0, lens, torch.from_numpy(point[None]).float())
+    assert rows.tolist() == [0]
+    assert [int(axis[0]) for axis in pixels] == coords.long().tolist()
+    assert find_pixels(cameras, 0, LENS, torch.from_numpy(point[None]).float())[1][1][0] > pixels[1][0]
+
+
 def test_views_outvote_what_one_of_them_alone_takes_for_the_object(
     images: list[np.ndarray], truth: list[np.ndarray]
 ) -> None:
@@ -136,7 +185,12 @@ def test_the_command_writes_what_readers_find(
 def test_what_has_no_object_gets_no_masks(tmp_path: Path, images: list[np.ndarray], edge_se: Any) -> None:
     rng = np.random.default_rng(1)
     empty = [photograph(np.zeros((SIZE, SIZE), dtype=bool), rng) for _ in images]
-    cases = {"wall": (empty, "no object"), "few": (images[:2], "at least 3")}
+    crowd = [unplain(rng) if i > 2 else image for i, image in enumerate(images)]
+    cases = {
+        "wall": (empty, "no object"),
+        "few": (images[:2], "at least 3"),
+        "crowd": (crowd, "only 3 of 12"),
+    }
     for name, (some, problem) in cases.items():
         write_capture(tmp_path / name, some)
         answer = edge_se("masks", "--data", tmp_path / name, "--output-path", tmp_path / f"{name}.png")

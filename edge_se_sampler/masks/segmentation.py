@@ -13,14 +13,15 @@ import cv2
 import numpy as np
 
 from edge_se_sampler.data.lens import Intrinsics
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.masks.backgrounds import MAX_DISTANCE, measure_distances
 from edge_se_sampler.masks.votes import UNKNOWN, count_votes
 
 ROUNDS = 2
 EMPTY, LIKELY, CERTAIN, SOLID = 0.5, 0.8, 0.9, 0.99
 """Shares of the other views: below EMPTY there is background; where less than LIKELY show foreground, a mask's is
-doubted; from CERTAIN on what is clearly no background stays foreground; background that foreground encloses is of the
-object (a white window in front of a white wall) only if SOLID, else it is a hole."""
+doubted; from CERTAIN on what is clearly no background stays foreground; what looks like background is of the object
+(a white window in front of a white wall) only if SOLID, else it shows through a hole."""
 CLEAR_DISTANCE = 10.0
 """Standard deviations from the background from which on a pixel is clearly none of it; and half of the most around it:
 at an edge, at least half of such a pixel is of the object."""
@@ -32,8 +33,13 @@ def segment(
     poses: Sequence[np.ndarray],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[np.ndarray]:
-    """Masks (H, W) bool of images (H, W, 3) uint8, True on the object, by the cameras that took them, poses (3, 4)."""
+    """Masks (H, W) bool of images (H, W, 3) uint8, True on the object, by the cameras that took them, poses (3, 4).
+    InputError if most images have no plain background."""
     distances = measure_distances(images)
+    plain = sum(not np.isinf(distance).all() for distance in distances)
+    if 2 * plain < len(images):
+        problem = f"only {plain} of {len(images)} images have a plain background along their border"
+        raise InputError(f"{problem}: masks need one in at least half of them")
     masks = [distance >= MAX_DISTANCE for distance in distances]
     with ThreadPoolExecutor() as pool:
         for number in range(ROUNDS):
@@ -48,10 +54,13 @@ def segment(
 def _cut(image: np.ndarray, distance: np.ndarray, mask: np.ndarray, votes: np.ndarray) -> np.ndarray:
     """One iteration of GrabCut, begun with a mask (H, W) as the votes correct it."""
     known = votes != UNKNOWN
+    if np.isinf(distance).all():  # no plain background: only the other views know
+        return mask & (~known | (votes >= CERTAIN))
     labels = np.where(mask & (~known | (votes >= LIKELY)), np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_PR_BGD))
     most = cv2.dilate(np.minimum(distance, np.float32(1e3)), np.ones((5, 5)))
     labels[mask & (distance >= np.maximum(CLEAR_DISTANCE, most / 2)) & (votes >= CERTAIN)] = cv2.GC_FGD
-    labels[known & (votes < EMPTY)] = cv2.GC_BGD
+    plain = ~mask & (distance < MAX_DISTANCE)
+    labels[known & (votes < np.where(plain, SOLID, EMPTY))] = cv2.GC_BGD
     foreground = labels & 1  # GC_FGD and GC_PR_FGD
     if foreground.all() or not foreground.any():
         return foreground > 0

@@ -55,13 +55,13 @@ def count_votes(
         widened = [cv2.dilate(mask.astype(np.uint8), kernel) for mask, kernel in zip(masks, kernels, strict=True)]
         foreground, seen = np.zeros((2, len(points)), dtype=np.int32)
         for i, image in enumerate(widened):
-            rows, pixels = _project(cameras, i, lenses[i], points)
+            rows, pixels = find_pixels(cameras, i, lenses[i], points)
             foreground[rows] += image[pixels]
             seen[rows] += 1
         often = seen >= max(2, MIN_SEEN * len(masks))
         points, foreground, seen = points[torch.from_numpy(often)], foreground[often], seen[often]
         for i, image in enumerate(widened):
-            rows, pixels = _project(cameras, i, lenses[i], points)
+            rows, pixels = find_pixels(cameras, i, lenses[i], points)
             share = (foreground[rows] - image[pixels].astype(np.float32)) / (seen[rows] - 1)
             votes[i] = _paint(votes[i], pixels, share, int(np.ceil(BLOCK * sizes[i])))
         of_object = points[torch.from_numpy(foreground >= MIN_OBJECT * seen)].numpy()
@@ -71,7 +71,7 @@ def count_votes(
     return votes
 
 
-def _project(
+def find_pixels(
     cameras: Cameras, camera: int, lens: Intrinsics, points: torch.Tensor
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """Which of points (n, 3) a camera sees: their m rows, and the rows and columns of their pixels, (m,) each."""
