@@ -11,7 +11,7 @@ import torch
 from exported import CELL, OPACITY, RADIUS, ball_model, ball_run, color_at, read_ply
 
 from edge_se_sampler.export import surface
-from edge_se_sampler.export.mesh import ask_colors, to_glb
+from edge_se_sampler.export.mesh import render_colors, to_glb
 from edge_se_sampler.export.surface import find_surface, keep_largest
 
 trimesh = pytest.importorskip("trimesh")
@@ -85,14 +85,14 @@ def test_colors_are_those_of_the_surface() -> None:
     model = ball_model()
     vertices, triangles = find_surface(model, OPACITY)
     normals = np.array(mesh_of(vertices, triangles).vertex_normals)
-    np.testing.assert_allclose(ask_colors(model, vertices, normals, 2 * CELL), color_at(vertices), atol=0.02)
+    np.testing.assert_allclose(render_colors(model, vertices, normals, 2 * CELL), color_at(vertices), atol=0.02)
 
 
 def test_colors_are_asked_from_outside() -> None:
     """Were each vertex seen from within, the ball would show its other side."""
     model = ball_model()
     position = np.array([[0.0, 0.0, RADIUS], [0.0, 0.0, -RADIUS]])
-    colors = ask_colors(model, position, position / RADIUS, 2 * CELL)
+    colors = render_colors(model, position, position / RADIUS, 2 * CELL)
     np.testing.assert_allclose(colors, color_at(position), atol=0.02)
 
 

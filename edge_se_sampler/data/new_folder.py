@@ -50,6 +50,8 @@ def _check_not_taken(out: Path, targets: Sequence[Path]) -> None:
         for target in targets:
             empty_folder = target.is_dir() and not target.is_symlink() and not any(target.iterdir())
             if os.path.lexists(target) and not empty_folder:
-                raise InputError(f"{target} is there already and is never overwritten: remove it, or give another out")
+                raise InputError(
+                    f"{target} is there already and is never overwritten: remove it, or write to another folder"
+                )
     except OSError as error:
         raise InputError(f"out is {out}, which cannot be read ({error.strerror}): give another folder") from error

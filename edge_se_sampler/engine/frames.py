@@ -16,7 +16,7 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.scene_file import read_json
 from edge_se_sampler.engine.files import make_folder, to_uint8, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.rendering import remove_background, render_outputs
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.ray_model import RayModel
 
@@ -41,18 +41,19 @@ def render_frame(
     camera = cameras[[index]].to(model.device, torch.float32)
     rays, (near, far) = camera.image_rays(0), model.config.depths
     keys = ("rgb_fine", "accumulation_fine", "depth_fine", "background")
-    rendered = {key: value.double().numpy() for key, value in render_outputs(model, rays, keys).items()}
-    rgb, alpha, background = rendered["rgb_fine"], rendered["accumulation_fine"].clip(0, 1), rendered["background"]
-    passing, opacity = 1 - alpha, np.maximum(alpha, 1e-3)
-    depth = rendered["depth_fine"] / rays.metadata["directions_norm"].cpu().numpy()
-    depth = ((depth - passing * far) / opacity).clip(near, far)  # of what is there, without the background's part
+    outputs_of_rays = render_outputs(model, rays, keys)
+    norm = rays.metadata["directions_norm"].cpu()
+    colors, distance = (x.numpy() for x in remove_background(outputs_of_rays, far * norm))
+    rgb, alpha, background = (outputs_of_rays[key].numpy() for key in (keys[0], keys[1], keys[3]))
+    alpha = alpha.clip(0, 1)
+    depth = (distance / norm.numpy()).astype(np.float64).clip(near, far)
     turbo = cv2.applyColorMap(to_uint8((far - depth) / (far - near)), cv2.COLORMAP_TURBO)[:, 0, ::-1] / 255
     steps = np.where(alpha > SEEN, np.rint(depth / depth_unit).clip(1, MAX_16_BITS), 0)
     images = {
         "rgb": to_uint8(rgb),
-        "rgba": to_uint8(np.concatenate(((rgb - passing * background) / opacity, alpha), axis=1)),
+        "rgba": to_uint8(np.concatenate((colors, alpha), axis=1)),
         "accumulation": to_uint8(alpha[:, 0]),
-        "depth": to_uint8(alpha * turbo + passing * background),
+        "depth": to_uint8(alpha * turbo + (1 - alpha) * background),
         "raw-depth": steps[:, 0].astype(np.uint16),
     }
     size = int(camera.height), int(camera.width)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +52,23 @@ def render_outputs(model: RayModel, rays: RayBundle, keys: Collection[str]) -> d
         chunks.append({key: outputs[key].cpu() for key in keys})
     model.train(was_training)
     return {key: torch.cat([chunk[key] for chunk in chunks]) for key in keys}
+
+
+def remove_background(outputs: Mapping[str, torch.Tensor], far: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of n rays' outputs (on the CPU, with rgb_fine, accumulation_fine, depth_fine and background), what they would be
+    without the background behind: colors (n, 3) in [0, 1] and distances (n, 1), world units, both means over what is
+    seen; of no meaning where that is nothing. far: (n, 1) distances at which the background counts."""
+    opacity = outputs["accumulation_fine"]
+    passing, opaque = 1 - opacity, opacity.clamp(min=1e-3)
+    colors = ((outputs["rgb_fine"] - passing * outputs["background"]) / opaque).clamp(0, 1)
+    return colors, (outputs["depth_fine"] - passing * far) / opaque
+
+
+def render_opaque(model: RayModel, rays: RayBundle) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Colors and distances of n rays as `remove_background`, and the accumulated opacity (n, 1)."""
+    outputs = render_outputs(model, rays, ("rgb_fine", "accumulation_fine", "depth_fine", "background"))
+    far = model.config.depths[1] * rays.metadata["directions_norm"].cpu()
+    return *remove_background(outputs, far), outputs["accumulation_fine"]
 
 
 def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:

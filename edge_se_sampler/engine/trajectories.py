@@ -68,7 +68,7 @@ def through(views: Views, depths: tuple[float, float], count: int) -> Cameras:
     focus, rotation = find_box(views, *depths).center, poses[:, :, :3]
     focus_in_camera = (rotation.transpose(0, 2, 1) @ (focus - poses[:, :, 3])[:, :, None])[:, :, 0]
     knots = np.concatenate((_quaternions(rotation), focus_in_camera), axis=1)
-    values = _catmull_rom(knots, np.linspace(0, len(knots) - 1, count))
+    values = catmull_rom(knots, np.linspace(0, len(knots) - 1, count))
     rotation = _rotations(values[:, :4])
     position = focus - (rotation @ values[:, 4:, None])[:, :, 0]
     return _with_poses(views.cameras, np.concatenate((rotation, position[:, :, None]), axis=2))
@@ -80,7 +80,7 @@ def _with_poses(like: Cameras, poses: np.ndarray) -> Cameras:
     return replace(first, camera_to_worlds=first.camera_to_worlds.new_tensor(poses))
 
 
-def _catmull_rom(knots: np.ndarray, at: np.ndarray) -> np.ndarray:
+def catmull_rom(knots: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Cubic curve through knots (n, d), numbered from 0, at parameters (m,) in [0, n - 1]: (m, d). Its slope at a knot
     is that between the knots before and after it (Catmull and Rom 1974)."""
     start = at.astype(int).clip(0, max(len(knots) - 2, 0))

@@ -12,7 +12,7 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8, write_atomically
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model
 from edge_se_sampler.errors import InputError, check_value
@@ -23,7 +23,7 @@ from edge_se_sampler.models.ray_model import RayModel
 
 RAYS_AT_ONCE = 2**16
 CELLS_BEFORE = 2
-"""How far outside the surface the rays begin that ask for its colors, in cells."""
+"""How far outside the surface the rays begin that its colors are rendered by, in cells."""
 
 
 def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: float, keep_components: int) -> str:
@@ -45,7 +45,7 @@ def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: floa
     vertices, triangles = keep_largest(vertices, triangles, keep_components)
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     normals = np.array(mesh.vertex_normals)
-    colors = ask_colors(model, vertices, normals, CELLS_BEFORE * float(model.grid.cell_size))
+    colors = render_colors(model, vertices, normals, CELLS_BEFORE * float(model.grid.cell_size))
     if path.suffix.lower() == ".glb":
         write_atomically(path, to_glb(vertices, normals, colors, triangles))
     else:
@@ -54,7 +54,7 @@ def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: floa
     return describe_file(path, f"{len(vertices):,} vertices, {len(triangles):,} faces, {closed}")
 
 
-def ask_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:
+def render_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:
     """Colors (n, 3) in [0, 1] of a surface: those of rays along its inward normals, which begin that far outside. For
     training fits the colors of rays: at the surface itself, where these have little weight yet, the network's color may
     be any."""
@@ -63,21 +63,11 @@ def ask_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, befo
     metadata = {"directions_norm": torch.ones_like(origins[:, :1]), "pixel_axes": origins.new_zeros(len(origins), 2, 3)}
     rays = RayBundle(origins, directions, torch.zeros_like(origins[:, :1], dtype=torch.int64), metadata)
     colors = []
-    with Progress(len(rays), "asking for colors") as progress:
+    with Progress(len(rays), "rendering colors") as progress:
         for start in range(0, len(rays), RAYS_AT_ONCE):
             colors.append(render_opaque(model, rays[start : start + RAYS_AT_ONCE])[0])
             progress.update(min(start + RAYS_AT_ONCE, len(rays)))
     return torch.cat(colors).numpy()
-
-
-def render_opaque(model: RayModel, rays: RayBundle) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of n rays, what they would show without the background behind: colors (n, 3) in [0, 1] and distances (n, 1),
-    world units, both means over what is seen; and the accumulated opacity (n, 1)."""
-    names = ("rgb_fine", "accumulation_fine", "depth_fine", "background")
-    rgb, opacity, depth, background = render_outputs(model, rays, names).values()
-    passing, far = 1 - opacity, model.config.depths[1] * rays.metadata["directions_norm"].cpu()
-    opaque = opacity.clamp(min=1e-6)
-    return ((rgb - passing * background) / opaque).clamp(0, 1), (depth - passing * far) / opaque, opacity
 
 
 def to_glb(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> bytes:

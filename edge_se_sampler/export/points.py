@@ -12,10 +12,10 @@ from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_model, read_train_views
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.export.mesh import render_opaque
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.models.ray_model import RayModel
 

@@ -2,7 +2,7 @@
 
 A wall or a table cloth has one color, which light and lens change smoothly over the image: a quadratic polynomial of
 x and y in each channel of CIE Lab. Several may meet (a wall and a table). What the object shows of itself at the border
-is told from them by its colors, which are more frequent at the center of the images.
+is distinguished from them by its colors, which are more frequent at the center of the images.
 """
 
 from __future__ import annotations

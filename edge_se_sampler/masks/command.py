@@ -51,7 +51,7 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path) -> str:
             masks = segment(images, lenses, [frame.pose for frame in frames], progress.update)
         shares = np.array([mask.mean() for mask in masks])
         if not shares.any() or shares.min() == 1:
-            problem = "no object is told from its background" if not shares.any() else "all is object"
+            problem = "no object stands out from the background" if not shares.any() else "the object fills all images"
             raise SourceLocation(folder).error(problem, "masks are found in front of a plain background alone")
         for frame, place, mask in zip(frames, places, masks, strict=True):
             file = workspace / place.relative_to(folder)

@@ -12,6 +12,7 @@ import viser
 import viser.transforms as tf
 
 from edge_se_sampler.data.cameras import Cameras, rotation_power
+from edge_se_sampler.engine.trajectories import catmull_rom
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 """Between OpenCV's camera axes, which viser has (x right, y down, z forward), and OpenGL's."""
@@ -66,12 +67,10 @@ def camera_path(keyframes: list[View], seconds: float, height: int) -> dict[str,
     rotations = torch.from_numpy(np.stack([view.pose[:, :3] for view in keyframes]))
     values = np.stack([np.append(view.pose[:, 3], view.fov) for view in keyframes])
     last, aspect, frames = len(keyframes) - 1, keyframes[0].aspect, []
-    for t in np.linspace(0, last, max(1, round(seconds * FPS))):
+    times = np.linspace(0, last, max(1, round(seconds * FPS)))
+    for t, (x, y, z, fov) in zip(times, catmull_rom(values, times), strict=True):
         k = min(int(t), max(0, last - 1))
-        before, start, end, after = (values[min(max(i, 0), last)] for i in range(k - 1, k + 3))
-        turned = rotation_power(rotations[k].T @ rotations[min(k + 1, last)], u := t - k)
-        quadratic, cubic = 2 * before - 5 * start + 4 * end - after, 3 * start - before - 3 * end + after
-        x, y, z, fov = start + u * (end - before + u * (quadratic + u * cubic)) / 2
+        turned = rotation_power(rotations[k].T @ rotations[min(k + 1, last)], t - k)
         matrix = np.eye(4)
         matrix[:3] = np.column_stack(((rotations[k] @ turned).numpy(), (x, y, z)))
         frame = {"camera_to_world": matrix.ravel().tolist(), "fov": math.degrees(fov), "aspect": aspect}

@@ -13,7 +13,7 @@ import viser.transforms as tf
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.viewer.address import ViewerConfig, check_viser
@@ -54,17 +54,13 @@ def surface_points(viewed: Viewed) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 3), world units, and their colors (m, 3) uint8: where random rays of the training views see something
     with an accumulation above a half."""
     model, found = viewed.model, []
-    rng, far = stream(viewed.trainer.config.machine.seed, 0, Stream.PROBE), model.config.depths[1]
+    rng = stream(viewed.trainer.config.machine.seed, 0, Stream.PROBE)
     with Progress(NUM_POINTS, "looking for points") as progress:
         for _ in range(MAX_LOOKS):
             rays = viewed.trainer.pipeline.datamanager.probe_rays(RAYS_PER_LOOK, rng)
-            outputs = render_outputs(model, rays, ["rgb_fine", "accumulation_fine", "depth_fine"])
-            accumulation = outputs["accumulation_fine"]
-            behind = (1 - accumulation).to(rays.origins)  # at the far depth, in the background's color
-            depth = outputs["depth_fine"].to(behind) - behind * far * rays.metadata["directions_norm"]
-            position = (rays.origins + depth / (1 - behind) * rays.directions).cpu()
-            color = (outputs["rgb_fine"] - behind.cpu() * model.config.background_level) / accumulation
-            found.append(torch.cat((position, color), dim=1)[accumulation[:, 0] > 0.5])
+            colors, distance, opacity = render_opaque(model, rays)
+            positions = rays.origins.cpu() + distance * rays.directions.cpu()
+            found.append(torch.cat((positions, colors), dim=1)[opacity[:, 0] > 0.5])
             progress.update(min(NUM_POINTS, count := sum(map(len, found))))
             if count >= NUM_POINTS:
                 break

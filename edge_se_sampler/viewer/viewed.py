@@ -20,6 +20,7 @@ from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.session import choose_device, read_train_views
 from edge_se_sampler.engine.show import probability_map
 from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.engine.trajectories import find_up
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.edges import unit_float
 from edge_se_sampler.sampling.image_batch import ImageBatch
@@ -102,9 +103,8 @@ class Viewed:
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) unit vector: what is above in most of them."""
-        up = self.cameras.camera_to_worlds[:, :, 1].double().cpu().numpy().mean(axis=0)
-        return up / max(float(np.linalg.norm(up)), 1e-9)
+        """(3,) unit vector: the scene's vertical."""
+        return find_up(self.cameras.to("cpu", torch.float64))
 
     def image(self, k: int, stride: int = 1) -> np.ndarray:
         """Every so many pixels, both ways, of the kth training image on the model's background, (H, W, 3) uint8."""
