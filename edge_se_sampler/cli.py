@@ -11,9 +11,10 @@ from typing import Annotated, Any, NoReturn, Union
 import tyro
 
 from edge_se_sampler.bench.commands import BENCHES
-from edge_se_sampler.commands import COMMANDS, Training
+from edge_se_sampler.commands import COMMANDS
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import registered_methods
+from edge_se_sampler.run_commands import Training
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

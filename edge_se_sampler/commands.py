@@ -1,27 +1,22 @@
-"""What every command of `edge-se` takes, and what it calls. Torch is imported only when a command runs."""
+"""The commands of `edge-se`; here those on data and experiments. Torch is imported only when a command runs."""
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from edge_se_sampler.data.config import DataFormat
 from edge_se_sampler.data.config import Masks as MeaningOfMasks
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import check_value
-from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
-from edge_se_sampler.methods import method_configs, registered_methods
+from edge_se_sampler.methods import registered_methods
 from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.run_commands import Eval, Export, Render, Resume, View
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 
 if TYPE_CHECKING:
     from edge_se_sampler.data.views import Views
-    from edge_se_sampler.engine.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -100,136 +95,6 @@ class Offcenter:
 @dataclass(frozen=True)
 class Train:
     """Train a method on a folder of images and cameras: edge-se train METHOD --data DIR."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What edge-se train METHOD takes."""
-
-    config: Annotated[TrainerConfig, tyro.conf.arg(name="")]
-    view: tyro.conf.UseCounterAction[int] = 0
-    """Fly through the model in the browser while it trains."""
-    viewer: ViewerConfig = field(default_factory=ViewerConfig)
-
-    def run(self) -> None:
-        if self.view:
-            self.viewer.check()
-        from edge_se_sampler.engine.session import prepare
-
-        trainer = prepare(self.config)
-        if not self.view:
-            train(trainer)
-            return
-        from edge_se_sampler.viewer.server import view_training
-
-        view_training(trainer, self.viewer, train)
-
-
-@dataclass(frozen=True)
-class _RunCommand:
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
-
-    def _load(self) -> tuple[RunFolder, TrainerConfig]:
-        from edge_se_sampler.engine.run_folder import RunFolder
-
-        run = RunFolder(self.run_folder)
-        return run, run.config(method_configs())
-
-
-@dataclass(frozen=True)
-class Resume(_RunCommand):
-    """Continue an interrupted run in place, under its own settings."""
-
-    max_seconds: float | None = None
-    """Stop this session after so many seconds."""
-
-    def run(self) -> None:
-        from edge_se_sampler.engine.session import prepare_resume
-
-        train(prepare_resume(*self._load(), self.max_seconds))
-
-
-@dataclass(frozen=True)
-class Eval(_RunCommand):
-    """Measure a run on its held-out views."""
-
-    output_path: Path = Path("eval.json")
-    """The json file to write."""
-    render_output_path: Path | None = None
-    """Folder for pictures of the views: ground truth on the left, rendering on the right."""
-
-    def run(self) -> None:
-        from edge_se_sampler.engine.evaluation import evaluate_run
-
-        results = evaluate_run(*self._load(), self.output_path, self.render_output_path)
-        print(f"PSNR {results['psnr']:.2f} dB over {results['num_images']} views; see {self.output_path}")
-
-
-@dataclass(frozen=True)
-class Render(_RunCommand):
-    """Render a run as a video, or as a folder of frames."""
-
-    output_path: Path = Path("render.gif")
-    """The video to write, .gif or .mp4 (extra [video]). Without an ending it is a folder: OUTPUT/00000.png and so on,
-    and frames.json, which says what they are; what was interrupted there goes on."""
-    outputs: tuple[Literal["rgb", "rgba", "accumulation", "depth", "raw-depth"], ...] = ("rgb",)
-    """What to show, side by side in a video: colors; in folders alone, colors with straight alpha; opacity; depth in
-    colors, near is red; in folders alone, depth along the optical axis as 16 bits, in the units that frames.json
-    says."""
-    kind: Literal["spiral", "interpolate", "train", "test"] | None = None
-    """Cameras: a turn around what the training views look at, or to and fro where they are on one side of it (spiral,
-    the default); a path through the training views in their order; the training views; the held-out ones."""
-    camera_path: Path | None = None
-    """Cameras of nerfstudio's viewer (camera_path.json) in place of a kind, in the units and axes of the run's data."""
-    num_frames: int = 60
-    """Frames of spiral and interpolate."""
-    frames_per_second: float | None = None
-    """Frame rate of the video; by default the camera path's, or 20."""
-    depth_unit: float | None = None
-    """What 1 means in raw-depth, world units; by default the power of ten that lets 16 bits reach to the far depth."""
-
-    def run(self) -> None:
-        from edge_se_sampler.engine.video import render_run
-
-        render_run(*self._load(), **{key: value for key, value in vars(self).items() if key != "run_folder"})
-        print(self.output_path)
-
-
-@dataclass(frozen=True)
-class Export(_RunCommand):
-    """Take a run to other programs: edge-se export RUN mesh|points|cameras|splats."""
-
-    what: Annotated[
-        Annotated[ExportMesh, tyro.conf.subcommand("mesh")]
-        | Annotated[ExportPoints, tyro.conf.subcommand("points")]
-        | Annotated[ExportCameras, tyro.conf.subcommand("cameras")]
-        | Annotated[ExportSplats, tyro.conf.subcommand("splats")],
-        tyro.conf.arg(name=""),
-    ]
-
-    def run(self) -> None:
-        print(self.what.export(*self._load()))
-
-
-@dataclass(frozen=True)
-class View(ViewerConfig, _RunCommand):
-    """Fly through a run in the browser; another process may be training it."""
-
-    html: Path | None = None
-    """Write one html file that needs no server instead: points, cameras and a turntable."""
-
-    def run(self) -> None:
-        check_viser()
-        if self.html is None:
-            from edge_se_sampler.viewer.server import view_run
-
-            view_run(*self._load(), self)
-        else:
-            from edge_se_sampler.viewer.html import write_html
-
-            write_html(*self._load(), self.html)
-            print(self.html)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -354,19 +219,3 @@ class Bench:
 
 _COMMANDS = (Demo, Scenes, Offcenter, Train, Resume, Eval, Render, Export, View, Show, Inspect, Masks, Methods, Bench)
 COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in _COMMANDS}
-
-
-def train(trainer: Any) -> None:
-    """Train, and say where the result is. Exits with 130 if it was stopped by Ctrl-C."""
-    from edge_se_sampler.engine.session import describe_run
-
-    print(describe_run(trainer), flush=True)
-    trainer.train()
-    resume = f"edge-se resume {trainer.run.path}"
-    if trainer.stop_requested:
-        print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
-        sys.exit(130)
-    print(f"{trainer.next_step} of {trainer.plan.num_steps or '?'} iterations in {trainer.elapsed:.1f} s of training")
-    print(f"measure it: edge-se eval {trainer.run.path}")
-    if trainer.next_step != trainer.plan.num_steps:
-        print(f"continue:   {resume}")

@@ -23,7 +23,7 @@ LAYERS = [
     ("engine",),
     ("methods",),
     ("nerfstudio", "bench", "export", "viewer", "masks"),
-    ("commands",),
+    ("commands", "run_commands"),
     ("cli",),
 ]
 """Files and folders of the package. Each may import from its own layer and from earlier ones."""

@@ -1,61 +1,35 @@
-"""edge-se view without a browser: turns, sizes of pictures, interruption, camera paths, and addresses."""
+"""edge-se view without a browser: turns, sizes of pictures, outputs and camera paths."""
 
 from __future__ import annotations
 
 import math
-import re
-import signal
-import socket
-import subprocess
-import sys
 import threading
-import time
-import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import pairwise
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
 from lean_models import VIEWS, config_of
-from tiny import SMALL, tiny_trainer
+from tiny import tiny_trainer
 
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.engine.checkpoint import load_checkpoint, save_checkpoint
 from edge_se_sampler.engine.rendering import render_outputs
-from edge_se_sampler.engine.run_folder import RunFolder, config_digest
-from edge_se_sampler.engine.trainer import Trainer
-from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.strategies import RankedError
 
 viser = pytest.importorskip("viser", reason="the viewer needs the [view] extra")
 
-from edge_se_sampler.viewer.address import ViewerConfig  # noqa: E402
+from browsers import keyframe, view_tiny, wait_until  # noqa: E402
+
 from edge_se_sampler.viewer.camera_path import FPS, View, camera_path  # noqa: E402
-from edge_se_sampler.viewer.panel import Panel  # noqa: E402
 from edge_se_sampler.viewer.rendering import Pace, Renderer, choose_heights  # noqa: E402
 from edge_se_sampler.viewer.viewed import Turns, Viewed  # noqa: E402
 
 
 @pytest.fixture
 def viewed() -> Viewed:
-    """A lean-nerf of three steps, without a folder."""
-    trainer = tiny_trainer(config_of(3), VIEWS)
-    for step in range(3):
-        trainer.train_iteration(step)
-    return Viewed(trainer)
-
-
-def wait_until(condition: Callable[[], Any], seconds: float = 20) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.005)
+    return view_tiny()
 
 
 def test_who_has_waited_longest_has_the_next_turn() -> None:
@@ -139,13 +113,6 @@ def test_a_view_of_a_training_camera_has_its_rays() -> None:
         torch.testing.assert_close(rays.origins, own.origins)
 
 
-def keyframe(angle: float, fov: float = 0.7) -> View:
-    """On a circle of radius 4 around the z axis, looking at the origin."""
-    back = np.array([math.cos(angle), math.sin(angle), 0.0])
-    right, up = np.array([-back[1], back[0], 0.0]), np.array([0.0, 0.0, 1.0])
-    return View(np.column_stack((right, up, back, 4 * back)), fov, 1.5)
-
-
 def read_path(content: dict[str, Any]) -> Cameras:
     """As nerfstudio's get_path_from_json does."""
     height, width = content["render_height"], content["render_width"]
@@ -216,239 +183,3 @@ def test_an_error_is_the_difference_to_the_image(viewed: Viewed) -> None:
     truth = image[..., :3] * image[..., 3:] + (1 - image[..., 3:])
     assert error is not None
     np.testing.assert_allclose(error, ((rgb.reshape(16, 16, 3).numpy() - truth) ** 2).mean(axis=2), atol=5e-3)
-
-
-class FakeClient:
-    """A browser that remembers the pictures that it is sent."""
-
-    def __init__(self, send: Callable[[np.ndarray], None] = lambda _: None) -> None:
-        self.pictures: list[np.ndarray] = []
-        self.callbacks: list[Callable[[Any], None]] = []
-        self.gui, self.scene = MagicMock(), MagicMock()
-        self.gui.add_dropdown.side_effect = lambda _, options: MagicMock(value=options[0])
-        self.gui.add_slider.side_effect = lambda *_, **__: MagicMock(value=128)
-        self.gui.add_number.side_effect = lambda _, value, **__: MagicMock(value=value)
-        self.scene.add_camera_frustum.side_effect = lambda *_, **kwargs: MagicMock(position=kwargs["position"])
-
-        def show(picture: np.ndarray, **_: Any) -> None:
-            self.pictures.append(picture)
-            send(picture)
-
-        self.scene.set_background_image.side_effect = show
-        self.camera = SimpleNamespace(image_height=128, on_update=self.callbacks.append)
-        self.move(0.0)
-
-    def move(self, angle: float) -> None:
-        view = keyframe(angle)
-        vars(self.camera).update(wxyz=view.wxyz, position=view.pose[:, 3], fov=view.fov, aspect=view.aspect)
-        for callback in self.callbacks:
-            callback(self.camera)
-
-    def panel(self, viewed: Viewed) -> Panel:
-        return Panel(self, viewed, scale=4.0)  # type: ignore[arg-type]
-
-
-def test_a_browser_sees_a_small_picture_at_once_and_then_a_sharp_one_until_it_moves(viewed: Viewed) -> None:
-    client = FakeClient()
-    panel = client.panel(viewed)
-    panel.renderer.frame = SimpleNamespace(rays=600, record=lambda *_: None)  # type: ignore[assignment]
-    wait_until(lambda: client.pictures and client.pictures[-1].shape == (128, 192, 3))
-    time.sleep(0.5)
-    count = len(client.pictures)
-    time.sleep(0.5)
-    assert len(client.pictures) == count  # nothing has changed: nothing is rendered
-    client.move(1.0)
-    wait_until(lambda: len(client.pictures) > count and client.pictures[-1].shape == (128, 192, 3))
-    assert [len(picture) for picture in client.pictures[count:]] == [20, 40, 80, 128]
-    assert (client.pictures[-1] != client.pictures[count - 1]).any()
-    viewed.trainer.next_step += 1  # newer weights: sharp again, but not small in between
-    wait_until(lambda: len(client.pictures) == count + 5)
-    assert len(client.pictures[-1]) == 128
-    panel.close()
-
-
-def test_the_next_move_interrupts_what_becomes_sharp(viewed: Viewed) -> None:
-    client = FakeClient()
-    panel, moves = client.panel(viewed), []
-    panel.renderer.frame = SimpleNamespace(rays=600, record=lambda *_: None)  # type: ignore[assignment]
-    wait_until(lambda: client.pictures and len(client.pictures[-1]) == 128)
-    count = len(client.pictures)
-
-    def move_once(*_: Any) -> None:
-        if len(client.pictures) == count + 1 and not moves:  # the second picture is being rendered
-            moves.append(client.move(0.2))
-
-    panel.renderer.turn = SimpleNamespace(rays=300, record=move_once)  # type: ignore[assignment]
-    client.move(0.1)
-    wait_until(lambda: len(client.pictures) > count and len(client.pictures[-1]) == 128)
-    assert [len(picture) for picture in client.pictures[count:]] == [20, 20, 40, 80, 128]
-    panel.close()
-
-
-def test_a_slow_browser_stalls_neither_training_nor_others(viewed: Viewed) -> None:
-    stuck, slow = threading.Event(), threading.Event()
-
-    def hang(_: np.ndarray) -> None:
-        stuck.set()
-        slow.wait(60)
-
-    slow_client, quick_client = FakeClient(hang), FakeClient()
-    panels = [slow_client.panel(viewed)]
-    assert stuck.wait(20)
-    for angle in range(100):  # its moves do not queue
-        slow_client.move(angle / 10)
-    panels.append(quick_client.panel(viewed))
-    wait_until(lambda: quick_client.pictures and len(quick_client.pictures[-1]) == 128)
-    with viewed.turns:
-        viewed.trainer.train_iteration(2)
-    assert len(slow_client.pictures) == 1
-    slow.set()
-    wait_until(lambda: len(slow_client.pictures[-1]) == 128)
-    assert len(slow_client.pictures) < 20
-    for panel in panels:
-        panel.close()
-
-
-def trained(folder: Path, view: Callable[[Trainer], None] = lambda _: None) -> Trainer:
-    trainer = tiny_trainer(config_of(60), VIEWS, folder)
-    view(trainer)
-    trainer.train()
-    return trainer
-
-
-def test_a_viewed_training_has_bit_for_bit_the_weights_of_another(tmp_path: Path) -> None:
-    client = FakeClient()
-
-    def view(trainer: Trainer) -> None:
-        panel = client.panel(Viewed(trainer))
-        panel.renderer.turn = SimpleNamespace(rays=500, record=lambda *_: None)  # type: ignore[assignment]
-
-        def fly() -> None:
-            for angle in range(1000):
-                client.move(angle / 10)
-                panel.viewed.probability(0, lambda: None)
-                panel.viewed.occupied_cells()
-                time.sleep(0.01)
-                if trainer.next_step == 60:
-                    break
-            panel.close()
-
-        threading.Thread(target=fly, daemon=True).start()
-        wait_until(lambda: client.pictures)
-
-    alone, seen = trained(tmp_path / "alone"), trained(tmp_path / "viewed", view)
-    assert len(client.pictures) > 1  # the first was waited for: at least one more while it trained
-    assert int(seen.pipeline.model.grid.level) > 0  # cells have been subdivided under the viewer's eyes
-    states = [trainer.pipeline.model.state_dict() for trainer in (alone, seen)]
-    for name, value in states[0].items():
-        assert torch.equal(states[1][name], value), name
-    assert torch.equal(alone.pipeline.model.random.get_state(), seen.pipeline.model.random.get_state())
-
-
-def files_of(run: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in run.rglob("*") if path.is_file()}
-
-
-def test_a_newer_checkpoint_is_shown_and_nothing_is_written(run: Path) -> None:
-    before = files_of(run)
-    viewed = Viewed.load(RunFolder(run), RunFolder(run).config(method_configs()))
-    assert (viewed.trainer.next_step, viewed.strategy) == (6, "se")
-    viewed.reload()
-    model = viewed.model
-    assert files_of(run) == before
-    (old,) = (run / "checkpoints").iterdir()
-    # what another process would write at a later step
-    state = load_checkpoint(old, config_digest(viewed.trainer.config))
-    state["step"], name = 8, next(name for name in state["model"] if "weight" in name)
-    state["model"][name] += 1
-    save_checkpoint(run / "checkpoints", 8, state)
-    viewed.reload()
-    assert viewed.trainer.next_step == 9
-    assert viewed.model is not model
-    assert torch.equal(viewed.model.state_dict()[name], state["model"][name])
-
-
-def test_a_port_that_is_taken_is_named(run: Path, edge_se) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        answer = edge_se("view", run, "--port", port)
-        training = edge_se("train", "lean-nerf", "--view", "--viewer.port", port, "--data", "nowhere")
-    for result in (answer, training):
-        assert result.code == 2
-        assert result.err.count("\n") == 1
-        assert f"port {port} of 127.0.0.1 is taken" in result.err
-
-
-@pytest.mark.parametrize(
-    ("flags", "named"),
-    [(("--port", "70000"), "70000"), (("--host", "no.such.host.invalid"), "no.such.host.invalid")],
-)
-def test_an_address_that_is_none_is_refused(run: Path, edge_se, flags: tuple[str, str], named: str) -> None:
-    answer = edge_se("view", run, *flags)
-    assert answer.code == 2
-    assert named in answer.err.splitlines()[-1]
-
-
-def test_another_host_has_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
-    ViewerConfig(port=0).check()
-    assert not capsys.readouterr().err
-    ViewerConfig(host="0.0.0.0", port=0).check()
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_without_viser_the_extra_is_named(run: Path, edge_se, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("edge_se_sampler.viewer.address.find_spec", lambda _: None)
-    for arguments in (("view", run), ("view", run, "--html", "x.html"), ("train", "lean-nerf", "--view")):
-        answer = edge_se(*arguments)
-        assert answer.code == 2
-        assert "edge-se-sampler[view]" in answer.err
-
-
-@contextmanager
-def ended(process: subprocess.Popen) -> Iterator[None]:
-    """Whatever fails, nothing waits for the process."""
-    try:
-        yield
-    finally:
-        process.kill()
-
-
-@pytest.mark.parametrize("trains", [False, True])
-def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, tmp_path: Path, trains: bool) -> None:
-    flags = ["view", run, "--port", 0]
-    if trains:
-        flags = [
-            "train",
-            "edge-se-nerf",
-            "--data",
-            scene,
-            "--output-dir",
-            tmp_path,
-            *SMALL,
-            "--view",
-            "--viewer.port",
-            0,
-        ]
-    command = [sys.executable, "-m", "edge_se_sampler.cli", *map(str, flags)]
-    with (
-        subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            # ignored, where a shell started the tests with &
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-        ) as process,
-        ended(process),
-    ):
-        assert process.stdout is not None
-        found = re.search(r"http://127\.0\.0\.1:(\d+)", process.stdout.readline())
-        assert found is not None
-        assert int(found[1]) > 0
-        page = urllib.request.urlopen(found[0], timeout=10).read()
-        assert b"<html" in page.lower()
-        if trains:
-            wait_until(lambda: "goes on until Ctrl-C" in process.stdout.readline())  # type: ignore[union-attr]
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
-    assert (process.returncode, out, err) == (0, "", "")
