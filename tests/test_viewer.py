@@ -183,3 +183,11 @@ def test_an_error_is_the_difference_to_the_image(viewed: Viewed) -> None:
     truth = image[..., :3] * image[..., 3:] + (1 - image[..., 3:])
     assert error is not None
     np.testing.assert_allclose(error, ((rgb.reshape(16, 16, 3).numpy() - truth) ** 2).mean(axis=2), atol=5e-3)
+
+
+def test_pixels_that_are_unknown_are_known_to_be(viewed: Viewed) -> None:
+    assert viewed.masks is None
+    masks = [np.random.default_rng(i).random(image.shape[:2]) < 0.5 for i, image in enumerate(VIEWS.images)]
+    found = Viewed(tiny_trainer(config_of(1), VIEWS.with_masks(masks))).masks
+    assert found is not None
+    np.testing.assert_array_equal(found, masks)

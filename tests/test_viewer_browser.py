@@ -12,7 +12,6 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
-import torch
 from lean_models import config_of
 
 from edge_se_sampler.data.synthetic.folder import make_scenes
@@ -149,7 +148,6 @@ def test_the_html_file_turns_without_a_server_or_a_network(
     trainer: Trainer, browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(html, "NUM_POINTS", 5_000)
-    monkeypatch.setattr(html, "RAYS_PER_LOOK", 5_000)
     html.write_html(trainer.run, trainer.config, tmp_path / "run.html")
     assert [file.name for file in tmp_path.iterdir()] == ["run.html"]
     context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True)
@@ -164,12 +162,3 @@ def test_the_html_file_turns_without_a_server_or_a_network(
     assert np.abs(shown(page) - before).mean() > 1
     assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
     context.close()
-
-
-def test_points_lie_on_the_surface(trainer: Trainer) -> None:
-    viewed = Viewed(trainer)
-    points, colors = html.surface_points(viewed)
-    assert len(points) == len(colors) > 1000
-    assert colors.dtype == np.uint8
-    grid = viewed.model.grid
-    assert grid.contains(torch.from_numpy(points)).double().mean() > 0.8

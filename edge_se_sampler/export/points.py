@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8
@@ -58,15 +60,36 @@ def load_points(run: RunFolder, config: TrainerConfig, path: Path, num_points: i
 
 
 def find_points(model: RayModel, views: Views, num_points: int, rng: np.random.Generator) -> PointCloud:
-    """Points where the rays of randomly chosen pixels, no one twice, meet something. A point between two surfaces, the
-    mean of a ray that sees both, is left out where the model's cells tell that nothing is there."""
-    sizes = np.array([image.shape[:2] for image in views.images])
+    """Points as `find_positions`, with normals; InputError if there are hardly any."""
+    values = find_positions(model, views.cameras, views.masks, num_points, rng)
+    if len(values) <= NEIGHBORS:
+        raise InputError("the model is opaque in no training view: it has learned nothing; train for longer")
+    positions, directions, colors, opacity = np.split(values, (3, 6, 9), axis=1)
+    normals, spacing = find_normals(positions, directions)
+    return PointCloud(positions, normals, colors, opacity[:, 0], spacing)
+
+
+def find_positions(
+    model: RayModel,
+    cameras: Cameras,
+    masks: Sequence[np.ndarray] | None,
+    num_points: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Where the rays of randomly chosen pixels, no one twice, meet something: at most so many rows (n, 10) of a
+    position in world units, the ray's direction, color and opacity. A point between two surfaces, the mean of a ray
+    that sees both, is left out where the model's cells are empty.
+
+    Args:
+        masks: (H, W) bool of each camera: the pixels that are known; None: all.
+    """
+    sizes = torch.cat((cameras.height, cameras.width), dim=1).cpu().numpy()
     ends = np.cumsum(sizes.prod(axis=1))
     order = np.arange(ends[-1], dtype=np.int32 if ends[-1] < 2**31 else np.int64)
-    if views.masks is not None:
-        order = order[np.concatenate([mask.reshape(-1) for mask in views.masks])]
+    if masks is not None:
+        order = order[np.concatenate([mask.reshape(-1) for mask in masks])]
     rng.shuffle(order)
-    cameras = views.cameras.to(model.device, model.dtype)
+    cameras = cameras.to(model.device, model.dtype)
     found, count = [], 0
     with Progress(num_points, "finding points") as progress:
         for start in range(0, len(order), PIXELS_AT_ONCE):
@@ -85,12 +108,7 @@ def find_points(model: RayModel, views: Views, num_points: int, rng: np.random.G
             progress.update(min(count, num_points))
             if count >= num_points:
                 break
-    values = torch.cat(found)[:num_points].double().numpy()
-    if len(values) <= NEIGHBORS:
-        raise InputError("the model is opaque in no training view: it has learned nothing; train for longer")
-    positions, directions, colors, opacity = np.split(values, (3, 6, 9), axis=1)
-    normals, spacing = find_normals(positions, directions)
-    return PointCloud(positions, normals, colors, opacity[:, 0], spacing)
+    return torch.cat(found)[:num_points].double().numpy()
 
 
 def find_normals(positions: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,23 +6,19 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 import viser.transforms as tf
 
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
-from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.export.points import find_positions
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 from edge_se_sampler.viewer.camera_path import View
 from edge_se_sampler.viewer.server import set_initial_camera, start_server
 from edge_se_sampler.viewer.viewed import Viewed
 
-NUM_POINTS, RAYS_PER_LOOK, MAX_LOOKS = 100_000, 2**14, 64
-"""Rays are rendered, so many at once, until there are so many points at their ends."""
+NUM_POINTS = 100_000
 TURN_SECONDS, TURN_STEPS = 12.0, 180
 """Of the turntable."""
 
@@ -32,7 +28,9 @@ def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
     check_viser()
     check_output(path, "--html")
     viewed = Viewed.load(run, config)
-    points, colors = surface_points(viewed)
+    rng = stream(config.machine.seed, 0, Stream.PROBE)
+    values = find_positions(viewed.model, viewed.cameras, viewed.masks, NUM_POINTS, rng)
+    points, colors = values[:, :3], to_uint8(values[:, 6:9])
     with start_server(ViewerConfig(port=0)) as server:
         focus, scale = set_initial_camera(server, viewed)
         table = server.scene.add_frame("/turntable", show_axes=False, position=focus)
@@ -48,21 +46,3 @@ def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
             table.wxyz = tf.SO3.exp(viewed.up * 2 * math.pi * step / TURN_STEPS).wxyz
             recording.insert_sleep(TURN_SECONDS / TURN_STEPS)
         write_atomically(path, recording.as_html().encode())
-
-
-def surface_points(viewed: Viewed) -> tuple[np.ndarray, np.ndarray]:
-    """Points (m, 3), world units, and their colors (m, 3) uint8: where random rays of the training views see something
-    with an accumulation above a half."""
-    model, found = viewed.model, []
-    rng = stream(viewed.trainer.config.machine.seed, 0, Stream.PROBE)
-    with Progress(NUM_POINTS, "looking for points") as progress:
-        for _ in range(MAX_LOOKS):
-            rays = viewed.trainer.pipeline.datamanager.probe_rays(RAYS_PER_LOOK, rng)
-            colors, distance, opacity = render_opaque(model, rays)
-            positions = rays.origins.cpu() + distance * rays.directions.cpu()
-            found.append(torch.cat((positions, colors), dim=1)[opacity[:, 0] > 0.5])
-            progress.update(min(NUM_POINTS, count := sum(map(len, found))))
-            if count >= NUM_POINTS:
-                break
-    points = torch.cat(found).double().numpy()
-    return points[:, :3], to_uint8(points[:, 3:])

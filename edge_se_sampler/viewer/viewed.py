@@ -102,6 +102,12 @@ class Viewed:
         return self.trainer.pipeline.datamanager.cameras
 
     @property
+    def masks(self) -> list[np.ndarray] | None:
+        """(H, W) bool of each training view: the pixels that are known; None: all."""
+        masks = self.trainer.pipeline.datamanager.image_batch.get("mask")
+        return None if masks is None else [mask[..., 0].numpy() for mask in masks]
+
+    @property
     def up(self) -> np.ndarray:
         """(3,) unit vector: the scene's vertical."""
         return find_up(self.cameras.to("cpu", torch.float64))
