@@ -16,6 +16,7 @@ from tiny import tiny_trainer
 
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.strategies import RankedError
 
 viser = pytest.importorskip("viser", reason="the viewer needs the [view] extra")
@@ -185,9 +186,11 @@ def test_an_error_is_the_difference_to_the_image(viewed: Viewed) -> None:
     np.testing.assert_allclose(error, ((rgb.reshape(16, 16, 3).numpy() - truth) ** 2).mean(axis=2), atol=5e-3)
 
 
-def test_pixels_that_are_unknown_are_known_to_be(viewed: Viewed) -> None:
-    assert viewed.masks is None
+def test_masks_leave_out_what_is_unknown(viewed: Viewed) -> None:
+    all_known = viewed.masks  # lean-nerf's are of pixels whose rays meet the hull
     masks = [np.random.default_rng(i).random(image.shape[:2]) < 0.5 for i, image in enumerate(VIEWS.images)]
     found = Viewed(tiny_trainer(config_of(1), VIEWS.with_masks(masks))).masks
+    assert all_known is not None
     assert found is not None
-    np.testing.assert_array_equal(found, masks)
+    np.testing.assert_array_equal(found, np.array(all_known) & masks)
+    assert Viewed(tiny_trainer(method_configs()["vanilla-nerf"], VIEWS)).masks is None

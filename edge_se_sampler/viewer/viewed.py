@@ -103,7 +103,7 @@ class Viewed:
 
     @property
     def masks(self) -> list[np.ndarray] | None:
-        """(H, W) bool of each training view: the pixels that are known; None: all."""
+        """(H, W) bool of each training view: the pixels that may be trained on; None: all."""
         masks = self.trainer.pipeline.datamanager.image_batch.get("mask")
         return None if masks is None else [mask[..., 0].numpy() for mask in masks]
 
