@@ -27,4 +27,4 @@ def find_mask(folder: Path, image: SourceFile) -> SourceFile | None:
     if not image.path.is_relative_to(os.path.realpath(folder)):
         return None
     place = place_of_mask(folder, image.path)
-    return locate_file(folder, str(place.relative_to(folder)), image.location) if place.is_file() else None
+    return locate_file(folder, str(place.relative_to(folder)), image.location) if os.path.isfile(place) else None
