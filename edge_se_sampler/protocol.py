@@ -101,8 +101,6 @@ class CallbackPipeline(Protocol):
 class CallbackTrainer(Protocol):
     """The part of a trainer that callbacks use."""
 
-    planned_steps: int
-    """Length of the run as first planned; resuming does not change it."""
     config: Any
     """The run's settings; `config.machine.seed` among them."""
     optimizer: Any

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
@@ -75,7 +76,8 @@ def following(
 ) -> EdgeSEPixelSampler:
     """A sampler bound to a run of `planned` steps, about to train `step`."""
     sampler = EdgeSEPixelSampler(EdgeSEPixelSamplerConfig(**settings), num_rays_per_batch=rays)
-    sampler.bind(squared_error=squared_error, planned_steps=planned, seed=seed, rank=rank, world=world)
+    progress = Plan(planned).progress
+    sampler.bind(squared_error=squared_error, progress=progress, seed=seed, rank=rank, world=world)
     sampler.set_step(step)
     return sampler
 

@@ -29,7 +29,9 @@ def manager_of(views: Any = VIEWS, rays: int = 50, **settings: Any) -> VanillaDa
 def bind_at_step(manager: VanillaDataManager, step: int) -> None:
     """Bind the sampler to a run of 100 steps that is at this step."""
     manager.train_pixel_sampler.bind(
-        squared_error=lambda batch: torch.arange(len(batch["indices"])).float(), planned_steps=100, seed=0
+        squared_error=lambda batch: torch.arange(len(batch["indices"])).float(),
+        progress=lambda step: step / 100,
+        seed=0,
     )
     manager.train_pixel_sampler.set_step(step)
 

@@ -211,7 +211,7 @@ def test_pixels_are_drawn_as_the_settings_say(masked: bool, strategy: str, setti
     named: dict[str, Any] = {"early": strategy, "images_per_step": "all"} | settings
     config = EdgeSEPixelSamplerConfig(**named)
     sampler = EdgeSEPixelSampler(config, num_rays_per_batch=90_000, background_color=background)
-    sampler.bind(squared_error=brightness, planned_steps=10, seed=1)
+    sampler.bind(squared_error=brightness, progress=lambda step: step / 10, seed=1)
     drawn = sampler.sample(host)["indices"]
     for k, (number, (height, width)) in enumerate(zip(NUMBERS, MIXED, strict=True)):
         if strategy == "edge":
@@ -305,7 +305,7 @@ def test_the_config_is_not_written_into(phase: dict) -> None:
     config = EdgeSEPixelSamplerConfig(**settings)
     before = copy.deepcopy(config)
     train = config.setup(num_rays_per_batch=17, keep_full_image=True)
-    train.bind(squared_error=brightness, planned_steps=10, seed=0)
+    train.bind(squared_error=brightness, progress=lambda step: step / 10, seed=0)
     train.set_step(5)
     train.sample(batch_of())
     assert config == before

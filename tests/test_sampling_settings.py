@@ -24,7 +24,6 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
         ("importance-weight", {"importance_weight": 0.5, "early": early, "late": "uniform"})
         for early in ("uniform", "precrop")
     ],
-    *[("error-source", {"error_source": scoring, "late": "uniform"}) for scoring in ("coarse", "cached")],
 ]
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.sampling.schedule import FixedSchedule
-from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig, SamplingSettings
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 @pytest.mark.parametrize(
@@ -28,22 +29,13 @@ def test_early_while_the_step_is_below_the_length(step: int, early_steps: float,
 
 @pytest.mark.parametrize("planned", [1, 9, 10, 11, 70, 230, 1000, 15_000, 200_000, 300_007])
 def test_the_papers_tenth_is_exact(planned: int) -> None:
-    schedule = FixedSchedule(SamplingSettings().early_length(planned))
+    schedule = FixedSchedule(SamplingSettings().early_fraction, Plan(planned).progress)
     tenth = -(-planned // 10)  # step < planned / 10 holds for this many steps
     around = range(max(tenth - 2, 0), tenth + 3)
     assert [schedule.phase(step) == "early" for step in around] == [step < tenth for step in around]
 
 
-@pytest.mark.parametrize(
-    ("settings", "length"),
-    [
-        ({"early_fraction": 0.0}, 0),
-        ({"early_fraction": 0.25}, 250),
-        ({"early_fraction": 1.0}, 1000),
-        ({"schedule": "steps", "early_steps": 17}, 17),
-        ({"schedule": "steps", "early_steps": 17, "early_fraction": 0.5}, 17),
-        ({"schedule": "steps", "early_steps": 5000}, 5000),
-    ],
-)
-def test_length_of_the_early_phase(settings: dict, length: float) -> None:
-    assert EdgeSEPixelSamplerConfig(**settings).early_length(1000) == length
+def test_of_a_plan_in_segments_the_early_phase_lasts_a_tenth_of_the_segments() -> None:
+    """As a time budget decides on them: the first ones are shorter, because nothing is known of their speed."""
+    schedule = FixedSchedule(0.1, Plan(None, [8] + 99 * [20]).progress)
+    assert [schedule.phase(step) for step in (0, 7, 187, 188, 1000)] == ["early", "early", "early", "late", "late"]

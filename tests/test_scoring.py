@@ -12,6 +12,7 @@ from tiny import tiny_model, tiny_rays, tiny_views
 from torch import Tensor
 
 from edge_se_sampler.data.config import VanillaDataManagerConfig
+from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.protocol import PixelSampler, TrainingCallbackLocation
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler, build_scorer
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
@@ -42,7 +43,9 @@ def test_candidates_are_scored_a_training_batch_at_a_time(candidates: int, rays:
 
 
 def attributes(planned: int, seed: int) -> Any:
-    trainer = SimpleNamespace(planned_steps=planned, config=SimpleNamespace(machine=SimpleNamespace(seed=seed)))
+    trainer = SimpleNamespace(
+        progress=Plan(planned).progress, config=SimpleNamespace(machine=SimpleNamespace(seed=seed))
+    )
     return SimpleNamespace(pipeline=SimpleNamespace(model=None), trainer=trainer)
 
 

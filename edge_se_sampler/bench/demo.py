@@ -94,11 +94,9 @@ def _train(trainer: Trainer) -> tuple[dict[str, Any], np.ndarray]:
     described = dict(line.split(maxsplit=1) for line in describe_run(trainer).splitlines())
     sampler: Any = trainer.pipeline.datamanager.config.pixel_sampler
     early, late = PIXELS[sampler.early], PIXELS[sampler.late]
-    # of the steps as first planned, which a time budget may cut short
-    early_share = min(1.0, sampler.early_length(trainer.planned_steps) / trainer.next_step)
     measured = {
         "model": described["model"],
-        "pixels": late if early == late else f"{early} for {early_share:.0%} of the training, then {late}",
+        "pixels": late if early == late else f"{early} for {sampler.early_fraction:.0%} of the training, then {late}",
         "steps": trainer.next_step,
         "rays_per_step": trainer.config.preset.rays,
         "training_seconds": round(trainer.setup_seconds + trainer.elapsed, 1),

@@ -20,7 +20,6 @@ from edge_se_sampler.models.config import (
     SizePreset,
 )
 from edge_se_sampler.protocol import InstantiateConfig
-from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 @dataclass(frozen=True)
@@ -174,10 +173,6 @@ class TrainerConfig(InstantiateConfig):
             raise InputError(f"--time-budget and --segments: {self.method_name} cannot follow them; use lean-nerf")
         if given and self.max_num_iterations is not None:
             raise InputError("--max-num-iterations and --time-budget or --segments: give one of them")
-        sampler = self.pipeline.datamanager.pixel_sampler
-        early = isinstance(sampler, SamplingSettings) and (sampler.early, sampler.schedule)
-        if given and early in (("edge", "fraction"), ("precrop", "fraction")):
-            raise InputError(f"--{SAMPLER.replace('_', '-')}.schedule fraction needs a number of iterations; use steps")
         valid = self.segments is None or (len(self.segments) == 100 and min(self.segments) >= 0 < sum(self.segments))
         check_value("segments", self.segments, valid, "100 numbers of iterations, not all of them 0")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -167,9 +166,11 @@ def describe_run(trainer: Trainer) -> str:
             f"{int(grid.max_level - grid.level)} times in at most {model.max_memory:.1f} GiB"
         )
     if isinstance(sampler, SamplingSettings):
-        until = "until the object is learned"
-        if sampler.schedule != "adaptive":
-            until = f"for {math.ceil(sampler.early_length(config.preset.iterations))} iterations"
+        until = {
+            "adaptive": "until the object is learned",
+            "steps": f"for {sampler.early_steps} iterations",
+            "fraction": f"for {100 * sampler.early_fraction:g} % of the training",
+        }[sampler.schedule]
         early = "" if sampler.early == sampler.late else f"{sampler.early} {until}, then "
         lines.append(f"pixels   {early}{sampler.late}")
     return "\n".join(lines)

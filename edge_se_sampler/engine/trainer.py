@@ -45,7 +45,6 @@ class Trainer:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
         self.plan = Plan(config.max_num_iterations, config.segments or (), config.budget_seconds)
         self.setup_seconds = setup_seconds
-        self.planned_steps = config.preset.iterations
         self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset, config.optimizer)
         self.scheduler = LambdaLR(self.optimizer, self._learning_rate_factor)
         self.next_step = 0

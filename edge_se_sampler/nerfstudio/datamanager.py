@@ -14,7 +14,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
-from edge_se_sampler.nerfstudio.resume import planned_steps, restore_schedule, schedule_writer
+from edge_se_sampler.nerfstudio.resume import restore_schedule, run_progress, schedule_writer
 from edge_se_sampler.nerfstudio.scoring import get_background_color, observe_training_errors, ray_errors
 from edge_se_sampler.sampling.pixel_sampler import build_scorer
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
@@ -84,7 +84,7 @@ def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
     sampler.background_color = get_background_color(trainer.pipeline.model)
     sampler.bind(
         squared_error=build_scorer(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
-        planned_steps=planned_steps(trainer),
+        progress=run_progress(trainer),
         seed=config.machine.seed,
         rank=config.machine.machine_rank * config.machine.num_devices + trainer.local_rank,
         world=trainer.world_size,

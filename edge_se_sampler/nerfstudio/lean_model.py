@@ -22,11 +22,10 @@ from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.config import OptimizerConfig
 from edge_se_sampler.engine.optimizers import RowAdam, build_adam, learning_rate_factor, torch_groups
 from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths, saved_grid
-from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
 from edge_se_sampler.models.lean import LeanModel, compile_ops
-from edge_se_sampler.nerfstudio.resume import planned_steps
+from edge_se_sampler.nerfstudio.resume import run_progress
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.image_batch import unit_interval
 from edge_se_sampler.sampling.random_streams import Stream, stream
@@ -133,11 +132,8 @@ class LeanNerfModel(Model):
         """Those of `LeanModel`; and what a training step begins with: the seed of its jitter, and its learning rate."""
         trainer = training_callback_attributes.trainer
         _check(trainer)
-        plan, seed = Plan(planned_steps(trainer)), trainer.config.machine.seed
+        progress, seed = run_progress(trainer), trainer.config.machine.seed
         settings, optimizer = (x[GROUP] for x in (trainer.config.optimizers, trainer.optimizers.optimizers))
-
-        def progress(step: int) -> float:
-            return min(1.0, plan.progress(step))
 
         def begin_step(step: int) -> None:
             self.field.begin_step(step, int(stream(seed, step, Stream.MODEL).integers(2**63)))

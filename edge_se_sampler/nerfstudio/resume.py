@@ -21,10 +21,11 @@ PLAN_FILE = "edge-se-plan.json"
 SCHEDULE_FILE = "edge-se-schedule.json"
 
 
-def planned_steps(trainer: Any) -> int:
-    """Iterations that the run was first planned for, of nerfstudio's trainer, once it has loaded its checkpoint; also
-    written beside this run's checkpoints, for the next to find. InputError if the loaded one's file is no plan, or this
-    run's cannot be written."""
+def run_progress(trainer: Any) -> Callable[[int], float]:
+    """The part of the run, in [0, 1], that is done when a step begins, of nerfstudio's trainer once it has loaded its
+    checkpoint: of the iterations that the run was first planned for, which are also written beside this run's
+    checkpoints, for the next to find. InputError if the loaded one's file is no plan, or this run's cannot be
+    written."""
     steps = trainer.config.max_num_iterations
     if loaded := _loaded_run(trainer):
         plan = loaded / PLAN_FILE
@@ -37,7 +38,7 @@ def planned_steps(trainer: Any) -> int:
         plan = trainer.checkpoint_dir.parent / PLAN_FILE
         plan.parent.mkdir(parents=True, exist_ok=True)
         write_json(plan, {"planned_steps": steps})
-    return steps
+    return lambda step: min(1.0, step / steps)
 
 
 def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:

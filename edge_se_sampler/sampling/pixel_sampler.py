@@ -14,7 +14,7 @@ from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.sampling.edges import WHITE
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, SamplerPart, TrainingStep
-from edge_se_sampler.sampling.schedule import AdaptiveSchedule, FixedSchedule, Schedule
+from edge_se_sampler.sampling.schedule import AdaptiveSchedule, FixedSchedule, Progress, Schedule
 from edge_se_sampler.sampling.strategies import Uniform, build_strategies
 
 SquaredError = Callable[[dict[str, Any]], Tensor]
@@ -52,21 +52,23 @@ class ImportantPixels:
         self._step = TrainingStep(squared_error=self._score)
 
     def bind(
-        self, *, squared_error: SquaredError, planned_steps: int, seed: int, rank: int = 0, world: int = 1
+        self, *, squared_error: SquaredError, progress: Progress, seed: int, rank: int = 0, world: int = 1
     ) -> None:
         """Follow a training run.
 
         Args:
             squared_error: scores candidates.
-            planned_steps: length of the run as first planned; resuming does not change it.
+            progress: of the training, which a share of it as the early phase follows.
             rank: of this process among `world` of a distributed run, see `TrainingStep`.
         """
         self._squared_error = squared_error
         self._step = replace(self._step, seed=seed, rank=rank, world=world)
         if self.config.schedule == "adaptive":
             self.schedule = AdaptiveSchedule(self.strategies[self.config.early].distribution)
+        elif self.config.schedule == "steps":
+            self.schedule = FixedSchedule(self.config.early_steps)
         else:
-            self.schedule = FixedSchedule(self.config.early_length(planned_steps))
+            self.schedule = FixedSchedule(self.config.early_fraction, progress)
 
     def set_step(self, step: int) -> None:
         """The step about to be trained; draws depend on it alone, and so does the phase of a fixed schedule."""

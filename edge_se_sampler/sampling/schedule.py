@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Literal
 
 from torch import Tensor
@@ -20,6 +21,8 @@ from edge_se_sampler.sampling.background import PlainBackgrounds, summarize_erro
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, SamplerPart, TrainingStep
 
 Phase = Literal["early", "late"]
+Progress = Callable[[int], float]
+"""The part of the training, in [0, 1], that is done when a step begins."""
 
 REMAINING_TO_END, REMAINING_TO_RETURN = 0.5, 0.8
 """The early phase does not end before R is below the first, and returns when R is above the second (hysteresis)."""
@@ -44,13 +47,14 @@ class Schedule(SamplerPart, ABC):
 
 
 class FixedSchedule(Schedule):
-    """Early while step < early_steps."""
+    """Early while progress(step) < early_length: a part of the training, or without a `progress` a number of steps."""
 
-    def __init__(self, early_steps: float) -> None:
-        self.early_steps = early_steps
+    def __init__(self, early_length: float, progress: Progress | None = None) -> None:
+        self.early_length, self.progress = early_length, progress
 
     def phase(self, step: int) -> Phase:
-        return "early" if step < self.early_steps else "late"
+        done = step if self.progress is None else self.progress(step)
+        return "early" if done < self.early_length else "late"
 
 
 class AdaptiveSchedule(Schedule):

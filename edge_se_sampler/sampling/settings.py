@@ -26,10 +26,11 @@ class SamplingSettings:
     late: Literal["uniform", "se"] = "se"
     """How pixels are drawn afterwards: uniformly, or by the rank of their squared error among uniform candidates."""
     schedule: Literal["fraction", "steps", "adaptive"] = "fraction"
-    """What ends the early phase: a share of the planned iterations; a number of steps; or (adaptive, for edges) that
+    """What ends the early phase: a share of the training; a number of steps; or (adaptive, for edges) that
     the object is learnt and edges no longer find larger errors. When either is no longer so, the phase returns."""
     early_fraction: float = 0.1
-    """Share of the planned iterations that the early phase lasts (schedule: fraction); the paper's 1/10."""
+    """Share of the training that the early phase lasts (schedule: fraction), by iterations or by the time budget; the
+    paper's 1/10."""
     early_steps: int = 0
     """Number of steps that the early phase lasts (schedule: steps)."""
     images_per_step: Literal["one", "all"] = "one"
@@ -82,7 +83,6 @@ class SamplingSettings:
             ("se_candidates", self.se_candidates >= 2, "must be at least 2, or there is nothing to choose from"),
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
-            ("error_source", self.error_source == "fine" or self.late == "se", "has no effect without late se"),
         ]
 
     def check(self) -> None:
@@ -90,11 +90,6 @@ class SamplingSettings:
         for field, valid, problem in self.rules():
             if not valid:
                 raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
-
-    def early_length(self, planned_steps: int) -> float:
-        """Steps that the early phase lasts in a run of `planned_steps`; without meaning under the adaptive schedule."""
-        # rounded: 0.07 * 100 is 7.000000000000001
-        return self.early_steps if self.schedule == "steps" else round(self.early_fraction * planned_steps, 6)
 
 
 @dataclass

@@ -50,12 +50,12 @@ def test_phases_switch_at_the_planned_step_also_after_resuming(name: str, host_s
     # for 500 more: a tenth of those would be early
     trainer = resumed(config, trainer, max_num_iterations=500)
     seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
-    assert trainer.pipeline.datamanager.train_pixel_sampler.schedule.early_steps == PLANNED / 10
+    assert trainer.pipeline.datamanager.train_pixel_sampler.schedule.progress(PLANNED // 2) == 0.5
     train(trainer, 3)
     assert strategies(seen) == [(PLANNED + k, "se") for k in range(3)]
     # and once more: the plan travels on
     third = resumed(config, trainer, max_num_iterations=500, timestamp="third")
-    assert third.pipeline.datamanager.train_pixel_sampler.schedule.early_steps == PLANNED / 10
+    assert third.pipeline.datamanager.train_pixel_sampler.schedule.progress(PLANNED // 2) == 0.5
 
 
 def test_a_run_stopped_in_its_early_phase_goes_on_in_it(host_scene: Path, tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_checkpoint_without_a_plan_is_reported(host_scene: Path, tmp_path: Pat
     (trainer.base_dir / PLAN_FILE).unlink()
     capfd.readouterr()
     again = resumed(config, trainer, max_num_iterations=400)
-    assert again.pipeline.datamanager.train_pixel_sampler.schedule.early_steps == 40
+    assert again.pipeline.datamanager.train_pixel_sampler.schedule.progress(200) == 0.5
     assert f"no plan at {trainer.base_dir / PLAN_FILE}" in capfd.readouterr().err
 
 

@@ -103,7 +103,7 @@ def scores(candidates: dict[str, Any]) -> torch.Tensor:
 def bound(config: Any, rays: int = RAYS, step: int = 3, **kwargs: Any) -> Any:
     """A sampler as the data manager makes it, following a run of 100 steps."""
     sampler = config.setup(num_rays_per_batch=rays, **kwargs)
-    sampler.bind(squared_error=scores, planned_steps=100, seed=5)
+    sampler.bind(squared_error=scores, progress=lambda step: step / 100, seed=5)
     sampler.set_step(step)
     return sampler
 
@@ -235,7 +235,7 @@ def test_unbound_it_draws_uniformly() -> None:
     batch = BATCHES["stacked"]()
     sampler = EdgeSEPixelSamplerConfig().setup(num_rays_per_batch=RAYS)
     uniform = EdgeSEPixelSamplerConfig(early="uniform", late="uniform").setup(num_rays_per_batch=RAYS)
-    uniform.bind(squared_error=scores, planned_steps=100, seed=0)
+    uniform.bind(squared_error=scores, progress=lambda step: step / 100, seed=0)
     assert sampler.strategy == "uniform"
     first = sampler.sample(batch)["indices"]
     for step in (2, 3):
