@@ -7,11 +7,11 @@ Torch-free, so that `--help` need not wait for torch.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from edge_se_sampler.errors import InputError, check_known
-from edge_se_sampler.protocol import PixelSamplerConfig
+from edge_se_sampler.protocol import ADDED_LATER, PixelSamplerConfig
 from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, strategy_names
 
 if TYPE_CHECKING:
@@ -58,6 +58,8 @@ class SamplingSettings:
     importance_weight: float = 0.0
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of the weights."""
+    soft_mining_alpha: float = field(default=0.6, metadata=ADDED_LATER)
+    """Soft Mining weights the loss by this power of 1 / error; 0: not at all."""
 
     def resolve_auto(self, has_masks: bool = False) -> Self:
         """Replace an `early` of auto.
@@ -88,12 +90,13 @@ class SamplingSettings:
             ("se_candidates", self.se_candidates >= 2, "must be at least 2, or there is nothing to choose from"),
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
+            ("soft_mining_alpha", 0 <= self.soft_mining_alpha <= 1, "must be between 0 and 1"),
             *self._strategy_rules(),
         ]
 
     def _strategy_rules(self) -> Iterator[tuple[str, bool, str]]:
         """Rules of the registered strategies."""
-        defaults = {field.name: field.default for field in fields(self)}
+        defaults = {setting.name: setting.default for setting in fields(self)}
         for name, strategy in PIXEL_STRATEGIES.items():
             phases = [phase for phase in strategy.phases if getattr(self, phase) == name]
             for setting in strategy.settings:
@@ -106,9 +109,9 @@ class SamplingSettings:
         """Raise InputError for a value or a combination that has no meaning, or a strategy that is not known."""
         check_known("pixel-sampler.early", [self.early], (*strategy_names("early"), "auto"))
         check_known("pixel-sampler.late", [self.late], strategy_names("late"))
-        for field, valid, problem in self.rules():
+        for setting, valid, problem in self.rules():
             if not valid:
-                raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
+                raise InputError(f"pixel-sampler.{setting.replace('_', '-')} is {getattr(self, setting)!r}: {problem}")
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run of `planned_steps`; without meaning under the adaptive schedule."""
