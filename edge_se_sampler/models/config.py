@@ -129,6 +129,8 @@ class NeRFModelConfig(ModelConfig):
     """Standard deviation of noise added to the raw density in training."""
     empty_space_skipping: bool = False
     """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
+    hard_samples: bool = False
+    """Evaluate all samples, but differentiate only those that matter, drawn by their gradients: cheaper, noisier."""
 
     @property
     def needs_grid(self) -> bool:
