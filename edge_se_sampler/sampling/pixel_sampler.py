@@ -93,7 +93,7 @@ class ImportantPixels:
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
 
-        With an importance weight (the settings' or the strategy's) the batch also has `weight` (N,), float32 loss weights.
+        With an importance weight, the settings' or the strategy's, also `weight` (N,), float32 loss weights.
 
         Raises:
             InputError: every pixel of every image is masked, or alpha edges of images without alpha.

@@ -42,7 +42,7 @@ def cell_of(position: np.ndarray, size: np.ndarray | int) -> np.ndarray:
 
 
 def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deepest: int) -> np.ndarray:
-    """Strengths of an image's pixels: (H, W) float64, 0 where they are not valid.
+    """Strengths of an image's pixels: (H, W) float32, 0 where they are not valid.
 
     Args:
         change: (H, W) color change.
@@ -52,14 +52,20 @@ def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deep
     """
     row, column = np.indices(level.shape)
     shift = MAX_LEVEL - level.astype(np.int64)
-    leaf_of_cell = (row >> shift << shift) * SIDE + (column >> shift << shift)  # by its first cell
-    rows, columns = (cell_of(np.arange(n), n) for n in change.shape)
-    leaf = leaf_of_cell[rows[:, None], columns].reshape(-1)
-    c = (np.maximum(change, CHANGE_FLOOR * change.mean()) + 1e-6) * valid
-    pixels, total = (np.bincount(leaf, values.reshape(-1), SIDE * SIDE) for values in (valid, c))
-    weight = np.where(level.reshape(-1) == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS)) / 2
-    uniform, by_change = weight / np.maximum(pixels, 1), weight / np.where(total > 0, total, 1)
-    return uniform[leaf].reshape(c.shape) * valid + by_change[leaf].reshape(c.shape) * c
+    leaf = (row >> shift << shift) * SIDE + (column >> shift << shift)  # of a cell, by the leaf's first
+    # (SIDE, H) and (SIDE, W): 1 where a row or column of pixels lies in one of cells
+    rows, columns = ((np.arange(SIDE)[:, None] == cell_of(np.arange(n), n)).astype(np.float32) for n in change.shape)
+
+    def by_leaf(values: np.ndarray) -> np.ndarray:
+        """For each cell the sum over the pixels of its leaf."""
+        return np.bincount(leaf.reshape(-1), (rows @ values @ columns.T).reshape(-1), SIDE * SIDE)[leaf]
+
+    drawn = valid.astype(np.float32)
+    c = np.maximum(change, np.float32(CHANGE_FLOOR) * change.mean()) + np.float32(1e-6)
+    pixels, total = by_leaf(drawn), by_leaf(c * drawn)
+    weight = np.where(level == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
+    uniform, by_change = (weight / 2 / np.where(pixels > 0, amount, 1) for amount in (pixels, total))
+    return drawn * (rows.T @ uniform.astype(np.float32) @ columns + rows.T @ by_change.astype(np.float32) @ columns * c)
 
 
 class Forest:

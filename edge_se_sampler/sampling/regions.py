@@ -67,9 +67,9 @@ class RegionTable:
         order, packed, count, shape = [self._order], [self._packed], [self._count], [self._shape]
         for region in regions:
             flat = region.numpy().reshape(-1)
-            order.append(np.argsort(flat, kind="stable").astype(np.int32))
-            quarters = np.pad(flat, (0, -len(flat) % 4)).reshape(-1, 4)
-            packed.append(np.bitwise_or.reduce(quarters << np.array([0, 2, 4, 6], dtype=np.uint8), axis=1))
+            order.extend(np.flatnonzero(flat == number).astype(np.int32) for number in (*range(REGIONS), MASKED))
+            four = np.pad(flat, (0, -len(flat) % 4)).reshape(-1, 4).T
+            packed.append(four[0] | four[1] << 2 | four[2] << 4 | four[3] << 6)
             count.append(np.bincount(flat, minlength=REGIONS + 1)[None, :REGIONS])
             shape.append(np.array([region.shape], dtype=np.int64))
         arrays = (np.concatenate(parts) for parts in (order, packed, count, shape))
