@@ -32,8 +32,6 @@ SIDE = 2**MAX_LEVEL
 PIXELS_PER_LEAF = 32
 LEARNT_PIXELS = 10
 CHANGE_FLOOR = 0.01
-WHOLE = np.zeros((SIDE, SIDE), dtype=np.uint8)
-"""Levels of a tree that is its root alone."""
 
 
 def cell_of(position: np.ndarray, size: np.ndarray | int) -> np.ndarray:
@@ -118,11 +116,6 @@ class Quadtree(Distribution):
     def __init__(self, settings: SamplingSettings) -> None:
         super().__init__(settings)
         self.forest = Forest()
-
-    def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
-        """That of an image which is one open leaf; raises as `color_change`."""
-        valid = np.ones(image.shape[:2], dtype=bool)
-        return leaf_strength(color_change(image, background_color), valid, WHOLE, 0)
 
     def tables(self, batch: ImageBatch) -> tuple[Any, Tensor]:
         """As `Distribution.tables`."""
