@@ -6,11 +6,10 @@ learnt   a leaf whose errors were small when those of its level were judged; it 
 weight   of a leaf: how many pixels it can draw if it is open, at most LEARNT_PIXELS of them if it is learnt
 c        color change around a pixel, at least CHANGE_FLOOR times its mean over the image
 
-A leaf is drawn by its weight; half of its pixels are drawn uniformly, half in proportion to c. The paper subdivides
-every few epochs, and begins each training with few leaves, ends it without any. Decided here: a level is judged as soon
-as PIXELS_PER_LEAF pixels were drawn, on average, for each of its open leaves, so that short trainings do it too; by the
-root mean squared error of a channel (the paper: an average error; its code: the largest); a leaf of which none was
-drawn counts as large; and a tree once grown stays.
+A leaf is drawn by its weight; half of its pixels are drawn uniformly, half in proportion to c, as in its code. Decided
+here: a level is judged as soon as PIXELS_PER_LEAF pixels were drawn, on average, for each of its open leaves, where the
+paper waits for epochs, which short trainings have none of; by the root mean squared error of a channel (the paper: an
+average error; its code: the largest); and trees stay to the end, where the paper's last epoch takes all pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.sampling.edges import color_change
+from edge_se_sampler.sampling.edges import CHANGE_STEP, color_change
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, TrainingStep
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -52,18 +51,19 @@ def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deep
     shift = MAX_LEVEL - level.astype(np.int64)
     leaf = (row >> shift << shift) * SIDE + (column >> shift << shift)  # of a cell, by the leaf's first
     # (SIDE, H) and (SIDE, W): 1 where a row or column of pixels lies in one of cells
-    rows, columns = ((np.arange(SIDE)[:, None] == cell_of(np.arange(n), n)).astype(np.float32) for n in change.shape)
+    rows, columns = ((np.arange(SIDE)[:, None] == cell_of(np.arange(n), n)).astype(np.float64) for n in change.shape)
 
     def by_leaf(values: np.ndarray) -> np.ndarray:
         """For each cell the sum over the pixels of its leaf."""
         return np.bincount(leaf.reshape(-1), (rows @ values @ columns.T).reshape(-1), SIDE * SIDE)[leaf]
 
-    drawn = valid.astype(np.float32)
-    c = np.maximum(change, np.float32(CHANGE_FLOOR) * change.mean()) + np.float32(1e-6)
-    pixels, total = by_leaf(drawn), by_leaf(c * drawn)
+    floor = CHANGE_FLOOR * change.mean(dtype=np.float64) / CHANGE_STEP
+    c = np.maximum(change / CHANGE_STEP, np.ceil(max(floor, 1))).astype(np.float64)  # whole numbers: sums are exact
+    pixels, total = by_leaf(valid), by_leaf(c * valid)
     weight = np.where(level == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
     uniform, by_change = (weight / 2 / np.where(pixels > 0, amount, 1) for amount in (pixels, total))
-    return drawn * (rows.T @ uniform.astype(np.float32) @ columns + rows.T @ by_change.astype(np.float32) @ columns * c)
+    strength = rows.T @ uniform @ columns + rows.T @ by_change @ columns * c
+    return (strength * valid).astype(np.float32)
 
 
 class Forest:
@@ -100,7 +100,7 @@ class Forest:
             return False
         by_leaf = (len(self.level), SIDE // side, side, SIDE // side, side)
         error, count = (values.reshape(by_leaf).sum(axis=(2, 4)) for values in (self.error, self.count))
-        grown = open_leaves & ((error > 3 * threshold**2 * count) | (count == 0))
+        grown = open_leaves & (error > 3 * threshold**2 * count)
         self.deepest += 1
         self.level[grown.repeat(side, axis=1).repeat(side, axis=2)] = self.deepest
         self.error[:], self.count[:] = 0, 0

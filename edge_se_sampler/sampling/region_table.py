@@ -76,4 +76,4 @@ class RegionTable:
         """(n,) p of drawn pixels times the number of drawable pixels of their image."""
         count = self._count[images.numpy()[drawn[:, 0].numpy()]]
         strength = np.append(self.strength, 0.0)[self.region(images, drawn)]
-        return torch.from_numpy(strength * count.sum(axis=1) / (count @ self.strength))
+        return torch.from_numpy(strength * count.sum(axis=1) / (count * self.strength).sum(axis=1))
