@@ -30,6 +30,8 @@ from edge_se_sampler.sampling.regions import FLOOR, WINDOW_PIXELS, classify
 
 STRATEGIES = ("regions", "quadtree", "expansive")
 LEARNING = STRATEGIES[:2]
+SIZES = [(9, 14), (40, 30), (5, 5)]
+"""One image whose leaves have more pixels than LEARNT_PIXELS."""
 
 
 def smooth_batch(sizes: list[tuple[int, int]], masked: bool = False, channels: int = 4) -> dict[str, Any]:
@@ -45,7 +47,7 @@ def smooth_batch(sizes: list[tuple[int, int]], masked: bool = False, channels: i
 def error_at(pixels: dict[str, Any]) -> Tensor:
     """Squared errors that depend on the pixel alone: large on the right, small where it is flat."""
     column = pixels["indices"][:, 2].double()
-    return 0.001 + column / 50 * (pixels["image"].double().std(dim=1) > 5)
+    return 0.0005 + column / 50 * (pixels["image"].double().std(dim=1) > 5)
 
 
 def trained(strategy: str, host: dict[str, Any], steps: int = 40, **settings: Any) -> EdgeSEPixelSampler:
@@ -236,6 +238,14 @@ def test_a_regions_error_is_a_running_mean() -> None:
     np.testing.assert_allclose(part.region_strength, [max(e / max(mean), FLOOR) for e in mean], rtol=1e-9)
 
 
+def test_no_region_is_forgotten() -> None:
+    part = following(late="regions").strategies["regions"].distribution
+    part.load_state_dict({"errors": [0.0, 2.0, 0.0], "seen": [5.0, 5.0, 0.0]})
+    assert part.region_strength.tolist() == [FLOOR, 1, 1]
+    part.load_state_dict({"errors": [0.0, 0.0, 0.0], "seen": [5.0, 5.0, 0.0]})
+    assert part.region_strength.tolist() == [1, 1, 1]
+
+
 @pytest.mark.parametrize("strategy", LEARNING)
 def test_errors_of_pixels_drawn_otherwise_are_not_learnt_from(strategy: str) -> None:
     host = smooth_batch(SAME)
@@ -256,15 +266,14 @@ def test_errors_of_pixels_drawn_otherwise_are_not_learnt_from(strategy: str) -> 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_pixels_are_drawn_as_the_rule_says(strategy: str, masked: bool) -> None:
-    sizes = [(9, 14), (40, 30), (5, 5)]
-    host = smooth_batch(sizes, masked)
+    host = smooth_batch(SIZES, masked)
     sampler = trained(strategy, host, images_per_step="all")
     p = [reference(sampler, host, k) for k in range(3)]
     sampler.set_num_rays_per_batch(60_000)
     drawn = sampler.sample(host)["indices"]
     counts = [
         pixel_counts(drawn[drawn[:, 0] == number][:, 1:], size).ravel()
-        for number, size in zip(NUMBERS, sizes, strict=True)
+        for number, size in zip(NUMBERS, SIZES, strict=True)
     ]
     expected = np.concatenate([image.ravel() for image in p]) / 3
     enough = (expected == 0) | (expected * 60_000 >= 5)
@@ -366,7 +375,7 @@ def test_the_union_over_ranks_is_one_draw(strategy: str, images_per_step: str, m
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_a_restored_sampler_draws_and_learns_the_same_bit_for_bit(strategy: str) -> None:
-    host = smooth_batch(MIXED, masked=True)
+    host = smooth_batch(SIZES, masked=True)
     for steps in (0, 13, 150):
         first = trained(strategy, host, steps)
         file = io.BytesIO()
