@@ -432,7 +432,7 @@ def test_nothing_to_draw_and_bad_pixels_are_input_errors(strategy: str) -> None:
     [
         ({"quadtree_threshold": 0.02}, "quadtree-threshold is 0.02: has no effect without early or late quadtree"),
         ({"late": "quadtree", "quadtree_threshold": 1.5}, "quadtree-threshold is 1.5: must be between 0 and 1"),
-        ({"late": "expansive", "importance_weight": 0.5}, "importance-weight is 0.5: 'expansive' weights"),
+        ({"late": "expansive", "importance_weight": 0.5}, "importance-weight is 0.5: expansive weights"),
     ],
 )
 def test_settings_without_meaning_are_refused(settings: dict[str, Any], problem: str) -> None:

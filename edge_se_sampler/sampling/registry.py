@@ -62,6 +62,16 @@ PIXEL_STRATEGIES: dict[str, PixelStrategy] = {
     "error-cdf": PixelStrategy(
         f"{PACKAGE}.instant_ngp:ErrorCdf", BOTH, "half by a coarse map of errors, rebuilt now and then (instant-ngp)"
     ),
+    "soft-mining": PixelStrategy(
+        f"{PACKAGE}.soft_mining:SoftMining",
+        BOTH,
+        "pixels that walk towards larger errors (Soft Mining)",
+        settings=("soft_mining_alpha",),
+        refusals=(("importance_weight", (0.0,), "soft-mining weights the loss itself, by soft-mining-alpha"),),
+    ),
+    "actray": PixelStrategy(
+        f"{PACKAGE}.actray:ActRay", BOTH, "by estimated losses, the longer unseen the more (ActRay)"
+    ),
     "regions": PixelStrategy(
         f"{PACKAGE}.regions:Regions", BOTH, "flat, textured or edge pixels, by the errors found in each"
     ),
@@ -75,7 +85,7 @@ PIXEL_STRATEGIES: dict[str, PixelStrategy] = {
         f"{PACKAGE}.expansive:Expansive",
         BOTH,
         "half at the strongest edges, half elsewhere, losses weighted to stand for the whole image",
-        refusals=(("importance_weight", (0.0,), "'expansive' weights losses by itself"),),
+        refusals=(("importance_weight", (0.0,), "expansive weights the loss itself"),),
     ),
 }
 """By the names that `early` and `late` give them."""

@@ -27,10 +27,12 @@ class SamplingSettings:
     """Which pixels train the network, early and late. Early and late together cover the paper's six strategies."""
 
     early: EarlyStrategy = "edge"
-    """How pixels are drawn in the early phase: uniformly, from the center of the image, or in proportion to edge
-    strength; auto: uniformly where alpha tells where the object is, otherwise by edges under the adaptive schedule."""
+    """How pixels are drawn in the early phase: uniformly, from the center of the image, in proportion to edge
+    strength, or as the errors tell that training found (see sampling/README.md); auto: uniformly where alpha tells
+    where the object is, otherwise by edges under the adaptive schedule."""
     late: LateStrategy = "se"
-    """How pixels are drawn afterwards: uniformly, or by the rank of their squared error among uniform candidates."""
+    """How pixels are drawn afterwards: uniformly, by the rank of their squared error among uniform candidates, or as
+    the errors tell that training found. The same name as early's: all the time."""
     schedule: Literal["fraction", "steps", "adaptive"] = "fraction"
     """What ends the early phase: a share of the planned iterations; a number of steps; or (adaptive, for edges) that
     the object is learnt and edges no longer find larger errors. When either is no longer so, the phase returns."""
@@ -58,7 +60,8 @@ class SamplingSettings:
     importance_weight: float = 0.0
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of the weights."""
-
+    soft_mining_alpha: float = field(default=0.6, metadata=ADDED_LATER)
+    """Soft Mining weights the loss by this power of 1 / error; 0: not at all."""
     quadtree_threshold: float = field(default=0.015, metadata=ADDED_LATER)
     """Root mean squared error of a channel above which the quadtree's leaves are subdivided, in [0, 1]."""
 
@@ -91,13 +94,14 @@ class SamplingSettings:
             ("se_candidates", self.se_candidates >= 2, "must be at least 2, or there is nothing to choose from"),
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
+            ("soft_mining_alpha", 0 <= self.soft_mining_alpha <= 1, "must be between 0 and 1"),
             ("quadtree_threshold", 0 <= self.quadtree_threshold <= 1, "must be between 0 and 1"),
             *self._strategy_rules(),
         ]
 
     def _strategy_rules(self) -> Iterator[tuple[str, bool, str]]:
         """Rules of the registered strategies."""
-        defaults = {known.name: known.default for known in fields(self)}
+        defaults = {setting.name: setting.default for setting in fields(self)}
         for name, strategy in PIXEL_STRATEGIES.items():
             phases = [phase for phase in strategy.phases if getattr(self, phase) == name]
             for setting in strategy.settings:
@@ -110,9 +114,9 @@ class SamplingSettings:
         """Raise InputError for a value or a combination that has no meaning, or a strategy that is not known."""
         check_known("pixel-sampler.early", [self.early], (*strategy_names("early"), "auto"))
         check_known("pixel-sampler.late", [self.late], strategy_names("late"))
-        for name, valid, problem in self.rules():
+        for setting, valid, problem in self.rules():
             if not valid:
-                raise InputError(f"pixel-sampler.{name.replace('_', '-')} is {getattr(self, name)!r}: {problem}")
+                raise InputError(f"pixel-sampler.{setting.replace('_', '-')} is {getattr(self, setting)!r}: {problem}")
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run of `planned_steps`; without meaning under the adaptive schedule."""
