@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
 
 from edge_se_sampler.sampling.cells import CellTable
 from edge_se_sampler.sampling.image_batch import ImageBatch
-from edge_se_sampler.sampling.parts import Distribution, PixelBatch, TrainingStep
+from edge_se_sampler.sampling.parts import Distribution
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
@@ -28,11 +27,6 @@ class LearnedDistribution(Distribution):
     def tables(self, batch: ImageBatch) -> tuple[CellTable, Tensor]:
         """The table of cells, and the index of each image in it."""
         return self.cells, self.cells.add(batch)
-
-    def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
-        """Draw `count` pixels as `Distribution.draw`; their p/u is kept, for the values will change."""
-        drawn = super().draw(batch, count, step)
-        return replace(drawn, drawn_ratio=self.density_ratio(batch, drawn.pixels))
 
     def state_dict(self) -> dict[str, Any]:
         """The cells'."""

@@ -19,9 +19,10 @@ from edge_se_sampler.sampling.cells import CellTable
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.sampling.region_table import RegionTable
 from edge_se_sampler.sampling.settings import SamplingSettings
 
-PixelSource = UniformPixels | PixelTable | CellTable
+PixelSource = UniformPixels | PixelTable | CellTable | RegionTable
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,8 @@ class Distribution(SamplerPart):
     from `tables` of its own."""
 
     name: ClassVar[str]
+    new_table: ClassVar[Callable[[], Any]] = PixelTable
+    """Makes what pixels are drawn from, with the methods of `PixelTable`."""
 
     def __init__(self, settings: SamplingSettings) -> None:
         self.settings = settings
@@ -109,7 +112,8 @@ class Distribution(SamplerPart):
         raise NotImplementedError
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
-        """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`."""
+        """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`. If it learns, their
+        p/u is kept."""
         rng = stream(step.seed, step.number, Stream.PIXELS)
         source, table_index, drawable = self.drawable(batch)
         if self.settings.images_per_step == "one":
@@ -117,7 +121,9 @@ class Distribution(SamplerPart):
         # strided: a table's draws come ordered by image
         pixels = source.draw(table_index[drawable], count * step.world, rng)[step.rank :: step.world]
         pixels[:, 0] = drawable[pixels[:, 0]]
-        return PixelBatch(batch, pixels, self)
+        return PixelBatch(
+            batch, pixels, self, drawn_ratio=self.density_ratio(batch, pixels) if self.needs_errors else None
+        )
 
     def density_ratio(self, batch: ImageBatch, pixels: Tensor) -> Tensor:
         """p/u (n,) of pixels (n, 3): position in the batch, row, column."""
@@ -126,7 +132,7 @@ class Distribution(SamplerPart):
 
     def clear(self) -> None:
         """Give back the memory of the tables."""
-        self._table, self._table_index = PixelTable(), dict[int, int]()
+        self._table, self._table_index = type(self).new_table(), dict[int, int]()
 
     def tables(self, batch: ImageBatch) -> tuple[PixelSource, Tensor]:
         """What is drawn from, and the index of each image of the batch in it, (k,) int64. InputError: an image has no
@@ -135,19 +141,23 @@ class Distribution(SamplerPart):
         new = [k for k, number in enumerate(numbers) if number not in self._table_index]
         if new:
             try:
-                self._table.add(in_threads(lambda k: self._valid_strength(batch, k), new))
+                self._table.add(in_threads(lambda k: self._named_strength(batch, k), new))
             except ValueError as problem:
                 raise InputError(str(problem)) from problem
             start = len(self._table_index)
             self._table_index.update({numbers[k]: start + i for i, k in enumerate(new)})
         return self._table, torch.tensor([self._table_index[number] for number in numbers])
 
-    def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
-        """(H, W) strengths of the image at position k, 0 where it is masked."""
+    def _named_strength(self, batch: ImageBatch, k: int) -> Tensor:
+        """What `_valid_strength` returns; InputError, naming the image, for its ValueError."""
         try:
-            strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
+            return self._valid_strength(batch, k)
         except ValueError as problem:
             raise InputError(f"image {int(batch.numbers[k])}: {problem}") from problem
+
+    def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
+        """(H, W) strengths of the image at position k, 0 where it is masked; raises as `strength`."""
+        strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
         return strength if batch.mask is None else strength * batch.valid(k)
 
     def drawable(self, batch: ImageBatch) -> tuple[PixelSource, Tensor, Tensor]:

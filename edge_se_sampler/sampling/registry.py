@@ -72,6 +72,21 @@ PIXEL_STRATEGIES: dict[str, PixelStrategy] = {
     "actray": PixelStrategy(
         f"{PACKAGE}.actray:ActRay", BOTH, "by estimated losses, the longer unseen the more (ActRay)"
     ),
+    "regions": PixelStrategy(
+        f"{PACKAGE}.regions:Regions", BOTH, "flat, textured or edge pixels, by the errors found in each"
+    ),
+    "quadtree": PixelStrategy(
+        f"{PACKAGE}.quadtree:Quadtree",
+        BOTH,
+        "by color change, in a quadtree subdivided where errors are large",
+        settings=("quadtree_threshold",),
+    ),
+    "expansive": PixelStrategy(
+        f"{PACKAGE}.expansive:Expansive",
+        BOTH,
+        "half at the strongest edges, half elsewhere, losses weighted to stand for the whole image",
+        refusals=(("importance_weight", (0.0,), "expansive weights the loss itself"),),
+    ),
 }
 """By the names that `early` and `late` give them."""
 

@@ -63,6 +63,8 @@ class SamplingSettings:
     power of the weights."""
     soft_mining_alpha: float = field(default=0.6, metadata=ADDED_LATER)
     """Soft Mining weights the loss by this power of 1 / error; 0: not at all."""
+    quadtree_threshold: float = field(default=0.015, metadata=ADDED_LATER)
+    """Root mean squared error of a channel above which the quadtree's leaves are subdivided, in [0, 1]."""
 
     def resolve_auto(self, has_masks: bool = False) -> Self:
         """Replace an `early` of auto.
@@ -94,6 +96,7 @@ class SamplingSettings:
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
             ("soft_mining_alpha", 0 <= self.soft_mining_alpha <= 1, "must be between 0 and 1"),
+            ("quadtree_threshold", 0 <= self.quadtree_threshold <= 1, "must be between 0 and 1"),
             *self._strategy_rules(),
         ]
 
