@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from pathlib import Path
 
 from edge_se_sampler.bench.outcomes import FAILURE_RULE
@@ -90,39 +91,37 @@ def table_of_claims(runs: list[Run]) -> str:
 
 def describe_use(runs: list[Run], strategy: str) -> str:
     """The verdicts at equal seconds in words: where it is better than uniform pixels, and where worse."""
-    labels = labels_of(runs)
-    verdicts = {
-        labels[panel]: comparison.verdict
-        for panel in labels
-        if (comparison := compare(runs, panel, strategy, "seconds")) and comparison.differences
-    }
-    where: dict[Verdict, list[str]] = {"better": [], "worse": []}
-    for label, verdict in verdicts.items():
-        if verdict in where:
-            where[verdict].append(label)
+    found = _compare_everywhere(runs, strategy)
+    verdicts = {label: comparison.verdict for label, comparison in found.items()}
     if not any(verdicts.values()):
         return VERDICTS[None] if verdicts else "–"
-    if not any(where.values()):
+    better, worse = ("; ".join(label for label in verdicts if verdicts[label] == v) for v in ("better", "worse"))
+    if not better and not worse:
         return f"no need: {VERDICTS['same']} from uniform pixels"
-    better = f"yes: better with {'; '.join(where['better'])}" if where["better"] else "no"
-    worse = f"worse with {'; '.join(where['worse'])}" if where["worse"] else ""
-    return ". ".join(filter(None, (better, worse))) if where["better"] else f"no: {worse}"
+    parts = [f"yes: {better}" if better else "no", f"worse: {worse}" if worse else ""]
+    return ". ".join(filter(None, parts))
+
+
+def _compare_everywhere(runs: list[Run], strategy: str) -> dict[str, Comparison]:
+    """Label of a panel -> what a strategy is there at equal seconds, where it was compared."""
+    found = {label: compare(runs, panel, strategy, "seconds") for panel, label in labels_of(runs).items()}
+    return {label: comparison for label, comparison in found.items() if comparison and comparison.differences}
 
 
 def _describe_differences(runs: list[Run], strategy: str) -> str:
     """Of every model the least and the greatest difference of its panels, what a step costs, and failures."""
     parts = []
     for model in dict.fromkeys(panel.model for panel in panels_of(runs)):
-        panels = [panel for panel in panels_of(runs) if panel.model == model]
-        found = [c for panel in panels if (c := compare(runs, panel, strategy, "seconds")) and c.differences]
-        if not found:
+        of_model = [run for run in runs if run["model"] == model]
+        differences = [c.differences["psnr"] for c in _compare_everywhere(of_model, strategy).values()]
+        if not differences:
             continue
-        differences = sorted(f"{c.differences['psnr']:+.2f}" for c in found)
-        ordered = sorted(differences, key=float)
-        text = f"{model} {ordered[0]}" + (f" to {ordered[-1]}" if ordered[0] != ordered[-1] else "")
+        ends = dict.fromkeys(f"{value:+.2f}" for value in (min(differences), max(differences)))
+        panels = panels_of(of_model)
         costs = [cost for panel in panels if (cost := cost_of_a_step(runs, panel, strategy)) is not None]
-        text += f", step x{sum(costs) / len(costs):.2f}" if costs else ""
         failures = sum(count_failures(runs, panel, strategy)[0] for panel in panels)
+        text = f"{model} {' to '.join(ends)}"
+        text += f", a step x{statistics.mean(costs):.2f}" if costs else ""
         parts.append(text + (f", {failures} failed" if failures else ""))
     return "; ".join(parts) or "–"
 

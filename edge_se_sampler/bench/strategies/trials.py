@@ -219,6 +219,7 @@ def without_alpha(views: Views) -> Views:
 def _train(config: TrainerConfig, views: Views, seconds: float | None) -> tuple[Trainer, Run]:
     """Train for so many CPU seconds, which the learning rate follows; None: for the config's number of steps."""
     compile_ops("cpu")  # or load them: like imports
+    torch.optim.Adam([torch.zeros(1)])  # a process's first one imports for a second
     disable_malloc_trimming()
     start = time.process_time()
     config = resolve_config(config, views)
