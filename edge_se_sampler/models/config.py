@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.protocol import InstantiateConfig
+from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 
 INFINITY = float("inf")
 GIB_PER_PIXEL = 1 / 400
@@ -129,6 +129,8 @@ class NeRFModelConfig(ModelConfig):
     """Standard deviation of noise added to the raw density in training."""
     empty_space_skipping: bool = False
     """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
+    hard_samples: bool = field(default=False, metadata=ADDED_LATER)
+    """Evaluate all samples, but differentiate only those that matter, drawn by their gradients: cheaper, noisier."""
 
     @property
     def needs_grid(self) -> bool:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
+from edge_se_sampler.sampling.distribution import PixelTable, in_threads
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -86,9 +86,13 @@ class Distribution(SamplerPart, ABC):
     first met, and kept: its pixels and its mask are taken to stay the same."""
 
     name: ClassVar[str]
+    new_table: ClassVar[Callable[[], Any]] = PixelTable
+    """Makes what pixels are drawn from, with the methods of `PixelTable`."""
 
     def __init__(self, settings: SamplingSettings) -> None:
         self.settings = settings
+        self.importance_weight = settings.importance_weight
+        """Power of the inverse-probability loss weights of what it draws; 0: none."""
         self.clear()
 
     @abstractmethod
@@ -118,31 +122,35 @@ class Distribution(SamplerPart, ABC):
 
     def clear(self) -> None:
         """Give back the memory of the tables."""
-        self._table, self._table_index = PixelTable(), dict[int, int]()
+        self._table, self._table_index = type(self).new_table(), dict[int, int]()
 
-    def tables(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor]:
+    def tables(self, batch: ImageBatch) -> tuple[Any, Tensor]:
         """What is drawn from, and the index of each image of the batch in it, (k,) int64. InputError: an image has no
         strengths."""
         numbers = batch.numbers.tolist()
         new = [k for k, number in enumerate(numbers) if number not in self._table_index]
         if new:
             try:
-                self._table.add(in_threads(lambda k: self._valid_strength(batch, k), new))
+                self._table.add(in_threads(lambda k: self._named_strength(batch, k), new))
             except ValueError as problem:
                 raise InputError(str(problem)) from problem
             start = len(self._table_index)
             self._table_index.update({numbers[k]: start + i for i, k in enumerate(new)})
         return self._table, torch.tensor([self._table_index[number] for number in numbers])
 
-    def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
-        """(H, W) strengths of the image at position k, 0 where it is masked."""
+    def _named_strength(self, batch: ImageBatch, k: int) -> Tensor:
+        """What `_valid_strength` returns; InputError, naming the image, for its ValueError."""
         try:
-            strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
+            return self._valid_strength(batch, k)
         except ValueError as problem:
             raise InputError(f"image {int(batch.numbers[k])}: {problem}") from problem
+
+    def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
+        """(H, W) strengths of the image at position k, 0 where it is masked; raises as `strength`."""
+        strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
         return strength if batch.mask is None else strength * batch.valid(k)
 
-    def drawable(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
+    def drawable(self, batch: ImageBatch) -> tuple[Any, Tensor, Tensor]:
         """What `tables` returns, and the positions of images with a pixel to draw, by ascending image number: hosts
         collate images in any order, and a draw should not depend on it. InputError: there is no pixel to draw, or an
         image has no strengths."""

@@ -93,7 +93,7 @@ class ImportantPixels:
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
 
-        With an importance weight the batch also has `weight` (N,), float32 loss weights.
+        With an importance weight (the settings' or the strategy's) the batch also has `weight` (N,), float32 loss weights.
 
         Raises:
             InputError: every pixel of every image is masked, or alpha edges of images without alpha.
@@ -110,8 +110,8 @@ class ImportantPixels:
         if self.needs_errors and not self._scored:
             self.pending_batch = drawn
         pixels = dict(drawn.values)
-        if self.config.importance_weight:
-            pixels["weight"] = (drawn.density_ratio() ** -self.config.importance_weight).float().to(batch.device)
+        if distribution.importance_weight:
+            pixels["weight"] = (drawn.density_ratio() ** -distribution.importance_weight).float().to(batch.device)
         if self.config.keep_full_image:
             pixels["full_image"] = image_batch["image"]
         return pixels

@@ -54,6 +54,21 @@ PIXEL_STRATEGIES: dict[str, PixelStrategy] = {
     "se": PixelStrategy(
         f"{STRATEGIES_MODULE}:RankedError", ("late",), "by the rank of the squared error", settings=("error_source",)
     ),
+    "regions": PixelStrategy(
+        "edge_se_sampler.sampling.regions:Regions", BOTH, "flat, textured or edge pixels, by the errors found in each"
+    ),
+    "quadtree": PixelStrategy(
+        "edge_se_sampler.sampling.quadtree:Quadtree",
+        BOTH,
+        "by color change, in a quadtree subdivided where errors are large",
+        settings=("quadtree_threshold",),
+    ),
+    "expansive": PixelStrategy(
+        "edge_se_sampler.sampling.expansive:Expansive",
+        BOTH,
+        "half at the strongest edges, half elsewhere, losses weighted to stand for the whole image",
+        refusals=(("importance_weight", (0.0,), "'expansive' weights losses by itself"),),
+    ),
 }
 """By the names that `early` and `late` give them."""
 

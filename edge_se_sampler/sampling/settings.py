@@ -7,11 +7,11 @@ Torch-free, so that `--help` need not wait for torch.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from edge_se_sampler.errors import InputError, check_known
-from edge_se_sampler.protocol import PixelSamplerConfig
+from edge_se_sampler.protocol import ADDED_LATER, PixelSamplerConfig
 from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, strategy_names
 
 if TYPE_CHECKING:
@@ -59,6 +59,9 @@ class SamplingSettings:
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of the weights."""
 
+    quadtree_threshold: float = field(default=0.015, metadata=ADDED_LATER)
+    """Root mean squared error of a channel above which the quadtree's leaves are subdivided, in [0, 1]."""
+
     def resolve_auto(self, has_masks: bool = False) -> Self:
         """Replace an `early` of auto.
 
@@ -88,12 +91,13 @@ class SamplingSettings:
             ("se_candidates", self.se_candidates >= 2, "must be at least 2, or there is nothing to choose from"),
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
+            ("quadtree_threshold", 0 <= self.quadtree_threshold <= 1, "must be between 0 and 1"),
             *self._strategy_rules(),
         ]
 
     def _strategy_rules(self) -> Iterator[tuple[str, bool, str]]:
         """Rules of the registered strategies."""
-        defaults = {field.name: field.default for field in fields(self)}
+        defaults = {known.name: known.default for known in fields(self)}
         for name, strategy in PIXEL_STRATEGIES.items():
             phases = [phase for phase in strategy.phases if getattr(self, phase) == name]
             for setting in strategy.settings:
@@ -106,9 +110,9 @@ class SamplingSettings:
         """Raise InputError for a value or a combination that has no meaning, or a strategy that is not known."""
         check_known("pixel-sampler.early", [self.early], (*strategy_names("early"), "auto"))
         check_known("pixel-sampler.late", [self.late], strategy_names("late"))
-        for field, valid, problem in self.rules():
+        for name, valid, problem in self.rules():
             if not valid:
-                raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
+                raise InputError(f"pixel-sampler.{name.replace('_', '-')} is {getattr(self, name)!r}: {problem}")
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run of `planned_steps`; without meaning under the adaptive schedule."""
