@@ -92,6 +92,8 @@ class Strategy:
     """Of the pixel sampler, whose early and late strategy are uniform otherwise."""
     models: tuple[str, ...] = tuple(MODELS)
     """Those that can be trained with it."""
+    model_settings: dict[str, Any] = field(default_factory=dict)
+    """Of the model's config."""
 
 
 STRATEGIES = {
@@ -99,10 +101,11 @@ STRATEGIES = {
     "se coarse": Strategy({"late": "se", "error_source": "coarse"}, ("nerf",)),
     "se cached": Strategy({"late": "se", "error_source": "cached"}),
     "edge + se": Strategy({"early": "edge", "late": "se"}),
+    "hard-samples": Strategy(models=("nerf",), model_settings={"hard_samples": True}),
     DEFAULT: Strategy(models=("lean", "lean-no-masks")),
 }
 """Every one of the registry in all phases that it may stand for; the ways to squared errors, and the paper's
-combination; and what lean-nerf does if nothing is set."""
+combination; uniform pixels of which hard samples are trained; and what lean-nerf does if nothing is set."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +160,7 @@ def build_config(trial: Trial, settings: Settings, output_dir: Path) -> TrainerC
         "machine.seed": trial.seed,
         "machine.device_type": "cpu",
         **model.changes,
+        **{f"{MODEL}.{name}": value for name, value in strategy.model_settings.items()},
     }
     if trial.strategy != DEFAULT:
         early_phase = {"schedule": "steps", "early_steps": max(1, length.steps // 10)}
