@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import count, product
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -233,10 +233,9 @@ def _train(config: TrainerConfig, views: Views, seconds: float | None) -> tuple[
         trainer.plan = Plan(None, time_budget=seconds)
     ready = spent = time.process_time() - start
     trainer.plan.decide(0, spent)
-    for step in count():
-        if step == trainer.plan.num_steps:
-            break
+    step = 0
+    while step != trainer.plan.num_steps:
         trainer.train_iteration(step)
-        spent = time.process_time() - start
-        trainer.plan.decide(step + 1, spent)
+        step, spent = step + 1, time.process_time() - start
+        trainer.plan.decide(step, spent)
     return trainer, {"steps": step, "seconds": round(spent, 3), "ready_seconds": round(ready, 3)}
