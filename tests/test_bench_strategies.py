@@ -183,7 +183,7 @@ def random_runs() -> list[dict[str, Any]]:
             steps=int(rng.integers(100, 200)), outcome=rng.choice(["converged", "collapsed", "underfit"]),
         )
         for strategy, scene, plan, placement, seed in product(
-            ("uniform", "edge", "se cached"), ("lego", "chair"), ("seconds", "steps"), ("centered", "shifted"), range(4)
+            ("uniform", "edge", "se-cached"), ("lego", "chair"), ("seconds", "steps"), ("centered", "shifted"), range(4)
         )
         if (strategy, scene, seed) != ("edge", "chair", 2)
     ]  # fmt: skip
@@ -225,12 +225,12 @@ def test_numbers_are_those_of_brute_force() -> None:
 @pytest.mark.parametrize(
     ("psnrs", "verdict", "use"),
     [
-        ((27.0, 27.1, 27.2), "better", "yes: lean, 200 px"),
-        ((25.4, 25.5, 25.3), "same", "no need: not distinguishable from uniform pixels"),
-        ((26.0, 26.1, 26.2), "same", "no need: not distinguishable from uniform pixels"),  # so does that of uniform
-        ((23.0, 23.1, 23.2), "worse", "no. worse: lean, 200 px"),
-        ((29.0,), None, "one seed: no verdict"),
-        ((24.0, 27.0, 27.1), "same", "no need: not distinguishable from uniform pixels"),  # its own spread counts
+        ((27.0, 27.1, 27.2), "better", "yes, better: lean, 200 px"),
+        ((25.4, 25.5, 25.3), "same", "no need, not distinguishable: lean, 200 px"),
+        ((26.0, 26.1, 26.2), "same", "no need, not distinguishable: lean, 200 px"),  # so does that of uniform
+        ((23.0, 23.1, 23.2), "worse", "no, worse: lean, 200 px"),
+        ((29.0,), None, "no verdict of one seed: lean, 200 px"),
+        ((24.0, 27.0, 27.1), "same", "no need, not distinguishable: lean, 200 px"),  # its own spread counts
     ],
 )
 def test_a_verdict_needs_more_than_the_spread_of_seeds(psnrs: tuple[float, ...], verdict: str | None, use: str) -> None:
@@ -241,6 +241,19 @@ def test_a_verdict_needs_more_than_the_spread_of_seeds(psnrs: tuple[float, ...],
     assert found.verdict == verdict
     assert describe_use(runs, "edge") == use
     assert best_at_equal_seconds(runs, PANEL) == ("uniform" if verdict == "worse" else "edge")
+
+
+def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
+    runs = []
+    for downscale, offsets in ((4, (2, 2)), (8, (-2, -2)), (16, (0, 0)), (2, (2,))):
+        for seed, offset in enumerate(offsets):
+            more = {"downscale": downscale, "size": [800 // downscale] * 2}
+            runs += [run_of(25 + seed / 10, seed, **more), run_of(25 + offset, seed, "edge", **more)]
+    expected = "yes, better: lean, 200 px; worse: lean, 100 px; not distinguishable: lean, 50 px"
+    assert describe_use(runs, "edge") == f"{expected}; no verdict of one seed: lean, 400 px"
+    less = [run for run in runs if run["downscale"] >= 8]
+    assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable: lean, 50 px"
+    assert describe_use(less, "se") == "–"
 
 
 def test_uniform_pixels_are_compared_with_nothing() -> None:
@@ -267,7 +280,7 @@ def test_the_page_shows_the_numbers(tmp_path: Path) -> None:
     )
     assert "| uniform | 25.10 (0.20) | – | – | – | 25.00 (0.00) | – | – | – | x1.00 | 2 of 4 |" in page
     assert "| lean, 200 px | edge | +1.10 | better | – | – |" in page
-    assert "| lean +1.10, a step x2.00 | yes: lean, 200 px |" in tables(tmp_path)["strategies"]
+    assert "| lean +1.10, a step x2.00 | yes, better: lean, 200 px |" in tables(tmp_path)["strategies"]
     assert "broken" in page
     assert "10 s or 800 steps" in page
     assert "ended in an error" not in describe(folder_of(tmp_path, runs))

@@ -22,15 +22,16 @@ from edge_se_sampler.bench.strategies.summary import (
     panels_of,
     strategies_of,
 )
-from edge_se_sampler.bench.strategies.trials import DEFAULT, PLANS, UNIFORM
+from edge_se_sampler.bench.strategies.trials import DEFAULT, PLANS, STRATEGIES, UNIFORM
 from edge_se_sampler.engine.figures import save_figure
 
 VERDICTS: dict[Verdict | None, str] = {
     "better": "better",
-    "same": "not distinguishable",
     "worse": "worse",
-    None: "one seed: no verdict",
+    "same": "not distinguishable",
+    None: "no verdict of one seed",
 }
+"""In words; the first that a strategy has anywhere says whether to use it."""
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
@@ -50,7 +51,7 @@ def describe(folder: Path) -> str:
         nerf=settings["nerf"],
         lean=settings["lean"],
         failure_rule=FAILURE_RULE,
-        scenes=" and ".join(sorted({run["scene"] for run in runs})),
+        scenes=", ".join(sorted({run["scene"] for run in runs})),
         claims=table_of_claims(runs),
         best=_table_of_best(runs),
         panels="\n\n".join(f"### {label}\n\n{_table_of(runs, panel)}" for panel, label in labels_of(runs).items()),
@@ -79,6 +80,7 @@ def table_of_claims(runs: list[Run]) -> str:
     rows = [
         [
             name,
+            STRATEGIES[name].description if name in STRATEGIES else "–",
             f"{CLAIMS[name].text} ({CLAIMS[name].source})" if name in CLAIMS else "–",
             _describe_differences(runs, name),
             describe_use(runs, name),
@@ -86,20 +88,18 @@ def table_of_claims(runs: list[Run]) -> str:
         for name in strategies_of(runs)
         if name != UNIFORM
     ]
-    return markdown_table(["", "claimed", "seen at equal CPU seconds, dB", "use it"], rows)
+    return markdown_table(["", "draws", "claimed", "seen at equal CPU seconds, dB", "use it"], rows)
 
 
 def describe_use(runs: list[Run], strategy: str) -> str:
     """The verdicts at equal seconds in words: where it is better than uniform pixels, and where worse."""
     found = _compare_everywhere(runs, strategy)
-    verdicts = {label: comparison.verdict for label, comparison in found.items()}
-    if not any(verdicts.values()):
-        return VERDICTS[None] if verdicts else "–"
-    better, worse = ("; ".join(label for label in verdicts if verdicts[label] == v) for v in ("better", "worse"))
-    if not better and not worse:
-        return f"no need: {VERDICTS['same']} from uniform pixels"
-    parts = [f"yes: {better}" if better else "no", f"worse: {worse}" if worse else ""]
-    return ". ".join(filter(None, parts))
+    where = {v: [label for label, comparison in found.items() if comparison.verdict == v] for v in VERDICTS}
+    judged = [verdict for verdict in VERDICTS if where[verdict]]
+    if not judged:
+        return "–"
+    answer = {"better": "yes, ", "worse": "no, ", "same": "no need, "}.get(judged[0] or "", "")
+    return answer + "; ".join(f"{VERDICTS[verdict]}: {' and '.join(where[verdict])}" for verdict in judged)
 
 
 def _compare_everywhere(runs: list[Run], strategy: str) -> dict[str, Comparison]:
@@ -116,7 +116,7 @@ def _describe_differences(runs: list[Run], strategy: str) -> str:
         differences = [c.differences["psnr"] for c in _compare_everywhere(of_model, strategy).values()]
         if not differences:
             continue
-        ends = dict.fromkeys(f"{value:+.2f}" for value in (min(differences), max(differences)))
+        ends = dict.fromkeys(_signed(value) for value in (min(differences), max(differences)))
         panels = panels_of(of_model)
         costs = [cost for panel in panels if (cost := cost_of_a_step(runs, panel, strategy)) is not None]
         failures = sum(count_failures(runs, panel, strategy)[0] for panel in panels)
@@ -134,7 +134,7 @@ def _table_of_best(runs: list[Run]) -> str:
             continue
         default = compare(runs, panel, DEFAULT, "seconds")
         rows.append([label, best, *_judge(compare(runs, panel, best, "seconds")), *_judge(default)])
-    head = ["", "best", "minus uniform", "verdict", f"{DEFAULT} minus uniform", "verdict"]
+    head = ["", "best", "minus uniform", "verdict", "lean-nerf's default minus uniform", "verdict"]
     return markdown_table(head, rows) if rows else ""
 
 
@@ -142,7 +142,7 @@ def _judge(comparison: Comparison | None) -> tuple[str, str]:
     """Difference and verdict."""
     if comparison is None or not comparison.differences:
         return "–", "–"
-    return f"{comparison.differences['psnr']:+.2f}", VERDICTS[comparison.verdict]
+    return _signed(comparison.differences["psnr"]), VERDICTS[comparison.verdict]
 
 
 def _table_of(runs: list[Run], panel: Panel) -> str:
@@ -163,7 +163,11 @@ def _show(comparison: Comparison | None) -> list[str]:
     if comparison is None:
         return ["–"] * (1 + len(METRICS))
     spread = "" if comparison.spread is None else f" ({decimals(comparison.spread)})"
-    texts = [f"{comparison.differences[m]:+.2f}" if comparison.differences else "–" for m in METRICS]
+    texts = [_signed(comparison.differences[m]) if comparison.differences else "–" for m in METRICS]
     if comparison.verdict in ("better", "worse"):
         texts[0] = f"**{texts[0]}**"
     return [decimals(comparison.psnr) + spread, *texts]
+
+
+def _signed(value: float) -> str:
+    return f"{round(value, 2) + 0.0:+.2f}"  # no -0.00

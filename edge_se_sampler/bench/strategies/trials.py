@@ -45,7 +45,7 @@ PLANS: tuple[PlanName, ...] = ("seconds", "steps")
 Placement = Literal["centered", "shifted"]
 PLACEMENTS: tuple[Placement, ...] = ("centered", "shifted")
 """The scene as it is; its pictures on a larger canvas, off center."""
-UNIFORM, DEFAULT = "uniform", "lean-nerf's default"
+UNIFORM, DEFAULT = "uniform", "default"
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ MODELS = {
 class Strategy:
     """How pixels are chosen."""
 
+    description: str
     settings: dict[str, Any] = field(default_factory=dict)
     """Of the pixel sampler, whose early and late strategy are uniform otherwise."""
     models: tuple[str, ...] = tuple(MODELS)
@@ -97,15 +98,19 @@ class Strategy:
 
 
 STRATEGIES = {
-    **{name: Strategy(dict.fromkeys(known.phases, name)) for name, known in PIXEL_STRATEGIES.items()},
-    "se coarse": Strategy({"late": "se", "error_source": "coarse"}, ("nerf",)),
-    "se cached": Strategy({"late": "se", "error_source": "cached"}),
-    "edge + se": Strategy({"early": "edge", "late": "se"}),
-    "hard-samples": Strategy(models=("nerf",), model_settings={"hard_samples": True}),
-    DEFAULT: Strategy(models=("lean", "lean-no-masks")),
+    **{n: Strategy(known.description, dict.fromkeys(known.phases, n)) for n, known in PIXEL_STRATEGIES.items()},
+    "se-coarse": Strategy(
+        "the same, of the coarse network's errors", {"late": "se", "error_source": "coarse"}, models=("nerf",)
+    ),
+    "se-cached": Strategy("the same, of errors that training found before", {"late": "se", "error_source": "cached"}),
+    "edge-se": Strategy("edge first, then se", {"early": "edge", "late": "se"}),
+    "hard-samples": Strategy(
+        "all pixels alike, the samples of their rays by their gradients", {}, ("nerf",), {"hard_samples": True}
+    ),
+    DEFAULT: Strategy("what lean-nerf does by itself", models=("lean", "lean-no-masks")),
 }
-"""Every one of the registry in all phases that it may stand for; the ways to squared errors, and the paper's
-combination; uniform pixels of which hard samples are trained; and what lean-nerf does if nothing is set."""
+"""Every one of the registry in all phases that it may stand for; ways to squared errors, and the paper's combination;
+uniform pixels of which hard samples are trained; and lean-nerf's default."""
 
 
 @dataclass(frozen=True)
