@@ -13,23 +13,27 @@ settings' filter, and none without any edge. Its code lets the factor of S fade 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from edge_se_sampler.sampling.edges import edge_strength
-from edge_se_sampler.sampling.parts import Distribution
-from edge_se_sampler.sampling.settings import SamplingSettings
+from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.parts import Distribution, PixelBatch, TrainingStep
 
 ANCHOR_AREA = 0.25
 """alpha."""
 ANCHOR_PIXELS = 0.5
 """beta."""
+LEVELS = 1000
 
 
 def anchors(edges: np.ndarray) -> np.ndarray:
-    """(H, W) bool: A, from edge strengths (H, W)."""
-    count = round(ANCHOR_AREA * edges.size)
-    weakest = np.partition(edges, edges.size - count, axis=None)[edges.size - count] if count else np.inf
-    return (edges >= weakest) & (edges > 0)
+    """(H, W) bool: A, from edge strengths (H, W) in LEVELS steps; all pixels of the last step that is needed."""
+    level = (edges * np.float32(LEVELS / max(float(edges.max()), 1e-9))).astype(np.int64)
+    at_least = np.bincount(level.reshape(-1))[::-1].cumsum()
+    weakest = level.max() - np.searchsorted(at_least, ANCHOR_AREA * edges.size)
+    return (level >= weakest) & (edges > 0)
 
 
 class Expansive(Distribution):
@@ -37,10 +41,6 @@ class Expansive(Distribution):
     Under a mask, shares are those of what it leaves of both."""
 
     name = "expansive"
-
-    def __init__(self, settings: SamplingSettings) -> None:
-        super().__init__(settings)
-        self.importance_weight = 1.0
 
     def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
         """beta / |A| or (1 - beta) / |S|; 1 if there is no anchor; raises as `edge_strength`."""
@@ -50,3 +50,8 @@ class Expansive(Distribution):
         if area in (0, 1):
             return np.ones(anchor.shape, dtype=np.float32)
         return np.where(anchor, np.float32(ANCHOR_PIXELS / area), np.float32((1 - ANCHOR_PIXELS) / (1 - area)))
+
+    def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
+        """As `Distribution.draw`, with loss weights."""
+        drawn = super().draw(batch, count, step)
+        return replace(drawn, loss_weight=(1 / drawn.density_ratio()).float())

@@ -87,13 +87,14 @@ class ImportantPixels:
     def check_images(self, image_batch: dict[str, Any]) -> None:
         """Before training, refuse images that a phase could draw nothing from: InputError as `sample`."""
         batch = self._read(image_batch)
-        for name in {self.config.early, Uniform.name}:
+        for name in self.strategies:
             self.strategies[name].distribution.drawable(batch)
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
 
-        With an importance weight (the settings' or the strategy's) the batch also has `weight` (N,), float32 loss weights.
+        With an importance weight, or a strategy that weights the loss, the batch also has `weight` (N,), float32 loss
+        weights.
 
         Raises:
             InputError: every pixel of every image is masked, or alpha edges of images without alpha.
@@ -110,8 +111,10 @@ class ImportantPixels:
         if self.needs_errors and not self._scored:
             self.pending_batch = drawn
         pixels = dict(drawn.values)
-        if distribution.importance_weight:
-            pixels["weight"] = (drawn.density_ratio() ** -distribution.importance_weight).float().to(batch.device)
+        if drawn.loss_weight is not None:
+            pixels["weight"] = drawn.loss_weight.to(batch.device)
+        elif self.config.importance_weight:
+            pixels["weight"] = (drawn.density_ratio() ** -self.config.importance_weight).float().to(batch.device)
         if self.config.keep_full_image:
             pixels["full_image"] = image_batch["image"]
         return pixels

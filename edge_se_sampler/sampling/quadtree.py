@@ -6,11 +6,10 @@ learnt   a leaf whose errors were small when those of its level were judged; it 
 weight   of a leaf: how many pixels it can draw if it is open, at most LEARNT_PIXELS of them if it is learnt
 c        color change around a pixel, at least CHANGE_FLOOR times its mean over the image
 
-A leaf is drawn by its weight; half of its pixels are drawn uniformly, half in proportion to c. The paper subdivides
-every few epochs, and begins each training with few leaves, ends it without any. Decided here: a level is judged as soon
-as PIXELS_PER_LEAF pixels were drawn, on average, for each of its open leaves, so that short trainings do it too; by the
-root mean squared error of a channel (the paper: an average error; its code: the largest); a leaf of which none was
-drawn counts as large; and a tree once grown stays.
+A leaf is drawn by its weight; half of its pixels are drawn uniformly, half in proportion to c, as in its code. Decided
+here: a level is judged as soon as PIXELS_PER_LEAF pixels were drawn, on average, for each of its open leaves, where the
+paper waits for epochs, which short trainings have none of; by the root mean squared error of a channel (the paper: an
+average error; its code: the largest); and trees stay to the end, where the paper's last epoch takes all pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.sampling.edges import color_change
+from edge_se_sampler.sampling.edges import CHANGE_STEP, color_change
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, TrainingStep
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -32,8 +31,6 @@ SIDE = 2**MAX_LEVEL
 PIXELS_PER_LEAF = 32
 LEARNT_PIXELS = 10
 CHANGE_FLOOR = 0.01
-WHOLE = np.zeros((SIDE, SIDE), dtype=np.uint8)
-"""Levels of a tree that is its root alone."""
 
 
 def cell_of(position: np.ndarray, size: np.ndarray | int) -> np.ndarray:
@@ -42,7 +39,7 @@ def cell_of(position: np.ndarray, size: np.ndarray | int) -> np.ndarray:
 
 
 def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deepest: int) -> np.ndarray:
-    """Strengths of an image's pixels: (H, W) float64, 0 where they are not valid.
+    """Strengths of an image's pixels: (H, W) float32, 0 where they are not valid.
 
     Args:
         change: (H, W) color change.
@@ -52,14 +49,21 @@ def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deep
     """
     row, column = np.indices(level.shape)
     shift = MAX_LEVEL - level.astype(np.int64)
-    leaf_of_cell = (row >> shift << shift) * SIDE + (column >> shift << shift)  # by its first cell
-    rows, columns = (cell_of(np.arange(n), n) for n in change.shape)
-    leaf = leaf_of_cell[rows[:, None], columns].reshape(-1)
-    c = (np.maximum(change, CHANGE_FLOOR * change.mean()) + 1e-6) * valid
-    pixels, total = (np.bincount(leaf, values.reshape(-1), SIDE * SIDE) for values in (valid, c))
-    weight = np.where(level.reshape(-1) == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS)) / 2
-    uniform, by_change = weight / np.maximum(pixels, 1), weight / np.where(total > 0, total, 1)
-    return uniform[leaf].reshape(c.shape) * valid + by_change[leaf].reshape(c.shape) * c
+    leaf = (row >> shift << shift) * SIDE + (column >> shift << shift)  # of a cell, by the leaf's first
+    # (SIDE, H) and (SIDE, W): 1 where a row or column of pixels lies in one of cells
+    rows, columns = ((np.arange(SIDE)[:, None] == cell_of(np.arange(n), n)).astype(np.float64) for n in change.shape)
+
+    def by_leaf(values: np.ndarray) -> np.ndarray:
+        """For each cell the sum over the pixels of its leaf."""
+        return np.bincount(leaf.reshape(-1), (rows @ values @ columns.T).reshape(-1), SIDE * SIDE)[leaf]
+
+    floor = CHANGE_FLOOR * change.mean(dtype=np.float64) / CHANGE_STEP
+    c = np.maximum(change / CHANGE_STEP, np.ceil(max(floor, 1))).astype(np.float64)  # whole numbers: sums are exact
+    pixels, total = by_leaf(valid), by_leaf(c * valid)
+    weight = np.where(level == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
+    uniform, by_change = (weight / 2 / np.where(pixels > 0, amount, 1) for amount in (pixels, total))
+    strength = rows.T @ uniform @ columns + rows.T @ by_change @ columns * c
+    return (strength * valid).astype(np.float32)
 
 
 class Forest:
@@ -96,7 +100,7 @@ class Forest:
             return False
         by_leaf = (len(self.level), SIDE // side, side, SIDE // side, side)
         error, count = (values.reshape(by_leaf).sum(axis=(2, 4)) for values in (self.error, self.count))
-        grown = open_leaves & ((error > 3 * threshold**2 * count) | (count == 0))
+        grown = open_leaves & (error > 3 * threshold**2 * count)
         self.deepest += 1
         self.level[grown.repeat(side, axis=1).repeat(side, axis=2)] = self.deepest
         self.error[:], self.count[:] = 0, 0
@@ -112,11 +116,6 @@ class Quadtree(Distribution):
     def __init__(self, settings: SamplingSettings) -> None:
         super().__init__(settings)
         self.forest = Forest()
-
-    def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
-        """That of an image which is one open leaf; raises as `color_change`."""
-        valid = np.ones(image.shape[:2], dtype=bool)
-        return leaf_strength(color_change(image, background_color), valid, WHOLE, 0)
 
     def tables(self, batch: ImageBatch) -> tuple[Any, Tensor]:
         """As `Distribution.tables`."""

@@ -14,7 +14,6 @@ left out: a pixel sampler sees no depths.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,9 @@ from torch import Tensor
 from edge_se_sampler.sampling.edges import color_change
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, TrainingStep
+from edge_se_sampler.sampling.region_table import MASKED, REGIONS, RegionTable
 from edge_se_sampler.sampling.settings import SamplingSettings
 
-REGIONS = 3
-MASKED = 3
-"""Stands for a region where no pixel may be drawn."""
 FLOOR = 0.05
 WINDOW_PIXELS = 2**14
 """A running mean is about one over the last so many pixels of its region."""
@@ -40,72 +37,6 @@ def classify(change: np.ndarray) -> np.ndarray:
     varied = change > texture
     edge = change[varied].mean(dtype=np.float64) if varied.any() else np.inf
     return varied.astype(np.uint8) + (change > edge)
-
-
-class RegionTable:
-    """Pixels of many images by region: 4.25 bytes each. Drawn by the strengths of their regions at that moment."""
-
-    def __init__(self) -> None:
-        self.strength = np.ones(REGIONS)
-        """w."""
-        self._order = np.zeros(0, dtype=np.int32)  # pixels of an image, by region
-        self._packed = np.zeros(0, dtype=np.uint8)  # region of each pixel, two bits each
-        self._count = np.zeros((0, REGIONS), dtype=np.int64)
-        self._shape = np.zeros((0, 2), dtype=np.int64)
-        self._first = self._first_packed = np.zeros(0, dtype=np.int64)  # where an image begins in each
-
-    def __len__(self) -> int:
-        return len(self._shape)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the table holds."""
-        return sum(value.nbytes for value in vars(self).values())
-
-    def add(self, regions: Iterable[Tensor]) -> None:
-        """Append images: their regions, (H, W) uint8, or MASKED."""
-        order, packed, count, shape = [self._order], [self._packed], [self._count], [self._shape]
-        for region in regions:
-            flat = region.numpy().reshape(-1)
-            order.append(np.argsort(flat, kind="stable").astype(np.int32))
-            quarters = np.pad(flat, (0, -len(flat) % 4)).reshape(-1, 4)
-            packed.append(np.bitwise_or.reduce(quarters << np.array([0, 2, 4, 6], dtype=np.uint8), axis=1))
-            count.append(np.bincount(flat, minlength=REGIONS + 1)[None, :REGIONS])
-            shape.append(np.array([region.shape], dtype=np.int64))
-        arrays = (np.concatenate(parts) for parts in (order, packed, count, shape))
-        self._order, self._packed, self._count, self._shape = arrays
-        pixels = self._shape.prod(axis=1)
-        self._first = np.cumsum(pixels) - pixels
-        self._first_packed = np.cumsum(-(-pixels // 4)) - -(-pixels // 4)
-
-    def drawable(self, images: Tensor) -> Tensor:
-        """(k,) bool: the images that have a pixel to draw."""
-        return torch.from_numpy(self._count[images.numpy()].any(axis=1))
-
-    def draw(self, images: Tensor, n: int, rng: np.random.Generator) -> Tensor:
-        """As `PixelTable.draw`, but in random order."""
-        u = rng.random((3, n))
-        which = (u[0] * len(images)).astype(np.int64)
-        image, count = images.numpy()[which], self._count[images.numpy()]
-        mass = np.cumsum(count * self.strength, axis=1)
-        region = (u[1][:, None] >= (mass / mass[:, -1:])[which, :-1]).sum(axis=1)
-        within = (u[2] * count[which, region]).astype(np.int64)
-        before = np.cumsum(count, axis=1) - count
-        pixel = self._order[self._first[image] + before[which, region] + within].astype(np.int64)
-        return torch.from_numpy(np.stack((which, *np.divmod(pixel, self._shape[image, 1])), axis=1))
-
-    def region(self, images: Tensor, drawn: Tensor) -> np.ndarray:
-        """r (n,) of drawn pixels, (n, 3) as `draw` returns them."""
-        which, row, column = drawn.numpy().T
-        image = images.numpy()[which]
-        pixel = row * self._shape[image, 1] + column
-        return self._packed[self._first_packed[image] + pixel // 4] >> (2 * (pixel % 4)) & 3
-
-    def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
-        """(n,) p of drawn pixels times the number of drawable pixels of their image."""
-        count = self._count[images.numpy()[drawn[:, 0].numpy()]]
-        strength = np.append(self.strength, 0.0)[self.region(images, drawn)]
-        return torch.from_numpy(strength * count.sum(axis=1) / (count @ self.strength))
 
 
 class Regions(Distribution):
@@ -125,10 +56,6 @@ class Regions(Distribution):
         """w (3,), > 0; a region without errors has the largest."""
         known = np.where(self.seen > 0, self.errors, self.errors.max())
         return np.maximum(known / known.max(), FLOOR) if known.any() else np.ones(REGIONS)
-
-    def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
-        """w of every pixel's region; raises as `color_change`."""
-        return self.region_strength[classify(color_change(image, background_color))]
 
     def tables(self, batch: ImageBatch) -> tuple[RegionTable, Tensor]:
         """As `Distribution.tables`, with the current strengths."""

@@ -18,7 +18,7 @@ from edge_se_sampler.errors import InputError
 ENTRY_POINT_GROUP = "edge_se_sampler.pixel_strategies"
 Phase = Literal["early", "late"]
 BOTH: tuple[Phase, ...] = ("early", "late")
-STRATEGIES_MODULE = "edge_se_sampler.sampling.strategies"
+PACKAGE = "edge_se_sampler.sampling"
 
 
 @dataclass(frozen=True)
@@ -48,23 +48,31 @@ class PixelStrategy:
 
 
 PIXEL_STRATEGIES: dict[str, PixelStrategy] = {
-    "uniform": PixelStrategy(f"{STRATEGIES_MODULE}:Uniform", BOTH, "all pixels alike"),
-    "precrop": PixelStrategy(f"{STRATEGIES_MODULE}:Precrop", ("early",), "the center of the image, uniformly"),
-    "edge": PixelStrategy(f"{STRATEGIES_MODULE}:Edge", ("early",), "in proportion to edge strength"),
+    "uniform": PixelStrategy(f"{PACKAGE}.strategies:Uniform", BOTH, "all pixels alike"),
+    "precrop": PixelStrategy(f"{PACKAGE}.strategies:Precrop", ("early",), "the center of the image, uniformly"),
+    "edge": PixelStrategy(f"{PACKAGE}.strategies:Edge", ("early",), "in proportion to edge strength"),
     "se": PixelStrategy(
-        f"{STRATEGIES_MODULE}:RankedError", ("late",), "by the rank of the squared error", settings=("error_source",)
+        f"{PACKAGE}.strategies:RankedError", ("late",), "by the rank of the squared error", settings=("error_source",)
+    ),
+    "error-map": PixelStrategy(
+        f"{PACKAGE}.torch_ngp:ErrorMapCells",
+        BOTH,
+        "by the errors last found in 128 x 128 cells (torch-ngp)",
+    ),
+    "error-cdf": PixelStrategy(
+        f"{PACKAGE}.instant_ngp:ErrorCdf", BOTH, "half by a coarse map of errors, rebuilt now and then (instant-ngp)"
     ),
     "regions": PixelStrategy(
-        "edge_se_sampler.sampling.regions:Regions", BOTH, "flat, textured or edge pixels, by the errors found in each"
+        f"{PACKAGE}.regions:Regions", BOTH, "flat, textured or edge pixels, by the errors found in each"
     ),
     "quadtree": PixelStrategy(
-        "edge_se_sampler.sampling.quadtree:Quadtree",
+        f"{PACKAGE}.quadtree:Quadtree",
         BOTH,
         "by color change, in a quadtree subdivided where errors are large",
         settings=("quadtree_threshold",),
     ),
     "expansive": PixelStrategy(
-        "edge_se_sampler.sampling.expansive:Expansive",
+        f"{PACKAGE}.expansive:Expansive",
         BOTH,
         "half at the strongest edges, half elsewhere, losses weighted to stand for the whole image",
         refusals=(("importance_weight", (0.0,), "'expansive' weights losses by itself"),),
