@@ -32,6 +32,8 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
     images_per_step: Literal["one", "all"] = "all"
     """Draw a step's pixels from all loaded images (nerfstudio) or from one image (the paper); an image is chosen
     first, a pixel in it second."""
+    soft_mining_alpha: float = 0.0
+    """Loss weights of Soft Mining: none, for nerfstudio's losses take no weights."""
 
     def rules(self) -> list[tuple[str, bool, str]]:
         """Those of every host, and nerfstudio's."""
@@ -40,6 +42,7 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
         return [
             *super().rules(),
             ("importance_weight", not self.importance_weight, no_weights),
+            ("soft_mining_alpha", not self.soft_mining_alpha, no_weights),
             ("error_source", self.error_source != "coarse", not_alone),
         ]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from edge_se_sampler.sampling.image_batch import ImageBatch
 
-BLOCK = 128
+BLOCK = 32
 """Cells whose mass is kept as one sum, so that a change of some cells needs no sum over all."""
 REJECTIONS = 8
 """Times that a masked pixel is drawn anew before its cell's pixels are counted."""
@@ -119,10 +119,25 @@ class CellTable:
 
     def cells_at(self, images: Tensor, pixels: Tensor) -> np.ndarray:
         """(n,) the cells of pixels (n, 3): position in `images`, row, column."""
-        which, row, column = pixels.numpy().T
-        image = images.numpy()[which]
-        (rows, columns), (height, width) = self.grid[image].T, self.size[image].T
-        return self.first[image] + row * rows // height * columns + column * columns // width
+        return self.cell_of(images[pixels[:, 0]].numpy(), pixels[:, 1:].numpy())
+
+    def cell_of(self, image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """(n,) the cells of pixels (n, 2), row and column, in images (n,)."""
+        grid = self.grid[image]
+        row, column = (pixel * grid // self.size[image]).T
+        return self.first[image] + row * grid[:, 1] + column
+
+    def pixel_at(self, image: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """(n, 2) the pixels at shares x (n, 2) of the rows and columns of images (n,), the nearest ones if outside."""
+        return np.clip((x * self.size[image]).astype(np.int64), 0, self.size[image] - 1)
+
+    def valid(self, image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Whether pixels (..., 2) of images (...) may be drawn."""
+        first = self._first_bit[image]
+        if not len(self._bits):
+            return np.ones(first.shape, dtype=bool)
+        bit = np.where(first >= 0, first + pixel[..., 0] * self.size[image, 1] + pixel[..., 1], 0)
+        return (first < 0) | (self._bits[bit >> 3] >> (7 - (bit & 7)).astype(np.uint8) & 1 > 0)
 
     def _image_masses(self, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         low = self._cumulative[self._first_block[images]]
@@ -161,24 +176,19 @@ class CellTable:
         pixel = low + (rng.random((len(cell), 2)) * (high - low)).astype(np.int64)
         bad = np.flatnonzero(self._first_bit[image] >= 0)
         for _ in range(REJECTIONS):
-            bad = bad[~self._valid(image[bad], pixel[bad])]
+            bad = bad[~self.valid(image[bad], pixel[bad])]
             pixel[bad] = low[bad] + (rng.random((len(bad), 2)) * (high - low)[bad]).astype(np.int64)
-        bad = bad[~self._valid(image[bad], pixel[bad])]
+        bad = bad[~self.valid(image[bad], pixel[bad])]
         if len(bad):  # few of the cell's pixels may be drawn: look at all
             height, width = (high - low)[bad].max(axis=0)
             window = low[bad, None] + np.stack(np.divmod(np.arange(height * width), width), axis=1)
             inside = (window < high[bad, None]).all(axis=2)
             window = np.minimum(window, high[bad, None] - 1)
-            valid = inside & self._valid(np.broadcast_to(image[bad, None], inside.shape), window)
+            valid = inside & self.valid(np.broadcast_to(image[bad, None], inside.shape), window)
             rank = (rng.random(len(bad)) * self.counts[cell[bad]]).astype(np.int64)
             place = (valid.cumsum(axis=1) <= rank[:, None]).sum(axis=1)
             pixel[bad] = window[np.arange(len(bad)), place]
         return pixel[:, 0], pixel[:, 1]
-
-    def _valid(self, image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Whether pixels (..., 2) of masked images (...) may be drawn."""
-        bit = self._first_bit[image] + pixel[..., 0] * self.size[image, 1] + pixel[..., 1]
-        return self._bits[bit >> 3] >> (7 - (bit & 7)).astype(np.uint8) & 1 > 0
 
     def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) float64 p of drawn pixels over that under uniform sampling, image first, pixel second."""

@@ -77,6 +77,16 @@ PIXEL_STRATEGIES: dict[str, PixelStrategy] = {
         "half at the strongest edges, half elsewhere, losses weighted to stand for the whole image",
         refusals=(("importance_weight", (0.0,), "'expansive' weights losses by itself"),),
     ),
+    "soft-mining": PixelStrategy(
+        f"{PACKAGE}.soft_mining:SoftMining",
+        BOTH,
+        "pixels that walk towards larger errors (Soft Mining)",
+        settings=("soft_mining_alpha",),
+        refusals=(("importance_weight", (0.0,), "soft-mining weights the loss itself, by soft-mining-alpha"),),
+    ),
+    "actray": PixelStrategy(
+        f"{PACKAGE}.actray:ActRay", BOTH, "by estimated losses, the longer unseen the more (ActRay)"
+    ),
 }
 """By the names that `early` and `late` give them."""
 

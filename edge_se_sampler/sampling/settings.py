@@ -58,6 +58,8 @@ class SamplingSettings:
     importance_weight: float = 0.0
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of the weights."""
+    soft_mining_alpha: float = field(default=0.6, metadata=ADDED_LATER)
+    """Soft Mining weights the loss by this power of 1 / error; 0: not at all."""
 
     quadtree_threshold: float = field(default=0.015, metadata=ADDED_LATER)
     """Root mean squared error of a channel above which the quadtree's leaves are subdivided, in [0, 1]."""
@@ -92,12 +94,14 @@ class SamplingSettings:
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
             ("quadtree_threshold", 0 <= self.quadtree_threshold <= 1, "must be between 0 and 1"),
+            ("soft_mining_alpha", 0 <= self.soft_mining_alpha <= 1, "must be between 0 and 1"),
             *self._strategy_rules(),
         ]
 
     def _strategy_rules(self) -> Iterator[tuple[str, bool, str]]:
         """Rules of the registered strategies."""
         defaults = {known.name: known.default for known in fields(self)}
+        defaults = {setting.name: setting.default for setting in fields(self)}
         for name, strategy in PIXEL_STRATEGIES.items():
             phases = [phase for phase in strategy.phases if getattr(self, phase) == name]
             for setting in strategy.settings:
@@ -113,6 +117,9 @@ class SamplingSettings:
         for name, valid, problem in self.rules():
             if not valid:
                 raise InputError(f"pixel-sampler.{name.replace('_', '-')} is {getattr(self, name)!r}: {problem}")
+        for setting, valid, problem in self.rules():
+            if not valid:
+                raise InputError(f"pixel-sampler.{setting.replace('_', '-')} is {getattr(self, setting)!r}: {problem}")
 
     def early_length(self, planned_steps: int) -> float:
         """Steps that the early phase lasts in a run of `planned_steps`; without meaning under the adaptive schedule."""
