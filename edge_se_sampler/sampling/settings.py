@@ -101,7 +101,6 @@ class SamplingSettings:
     def _strategy_rules(self) -> Iterator[tuple[str, bool, str]]:
         """Rules of the registered strategies."""
         defaults = {known.name: known.default for known in fields(self)}
-        defaults = {setting.name: setting.default for setting in fields(self)}
         for name, strategy in PIXEL_STRATEGIES.items():
             phases = [phase for phase in strategy.phases if getattr(self, phase) == name]
             for setting in strategy.settings:

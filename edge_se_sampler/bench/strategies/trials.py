@@ -171,17 +171,7 @@ def build_config(trial: Trial, settings: Settings, output_dir: Path) -> TrainerC
         early_phase = {"schedule": "steps", "early_steps": max(1, length.steps // 10)}
         sampler = {"early": UNIFORM, "late": UNIFORM, "error_source": "fine", **early_phase, **strategy.settings}
         changes |= {f"{SAMPLER}.{name}": value for name, value in sampler.items()}
-    return _allow(override(method_configs()[model.method], changes))
-
-
-def _allow(config: TrainerConfig) -> TrainerConfig:
-    """The config with settings that its strategies refuse replaced by the first value that they work with."""
-    sampler: Any = config.pipeline.datamanager.pixel_sampler
-    refusals = [
-        r for name in (sampler.early, sampler.late) if name in PIXEL_STRATEGIES for r in PIXEL_STRATEGIES[name].refusals
-    ]
-    changes = {f"{SAMPLER}.{name}": values[0] for name, values, _ in refusals if getattr(sampler, name) not in values}
-    return override(config, changes)
+    return override(method_configs()[model.method], changes)
 
 
 def run_trial(trial: Trial, settings: Settings, data: Path) -> Run:
