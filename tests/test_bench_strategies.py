@@ -226,11 +226,11 @@ def test_numbers_are_those_of_brute_force() -> None:
     ("psnrs", "verdict", "use"),
     [
         ((27.0, 27.1, 27.2), "better", "yes, better: lean, 200 px"),
-        ((25.4, 25.5, 25.3), "same", "no need, not distinguishable: lean, 200 px"),
-        ((26.0, 26.1, 26.2), "same", "no need, not distinguishable: lean, 200 px"),  # so does that of uniform
+        ((25.4, 25.5, 25.3), "same", "no need, not distinguishable in 1 of 1"),
+        ((26.0, 26.1, 26.2), "same", "no need, not distinguishable in 1 of 1"),  # so does that of uniform
         ((23.0, 23.1, 23.2), "worse", "no, worse: lean, 200 px"),
-        ((29.0,), None, "no verdict of one seed: lean, 200 px"),
-        ((24.0, 27.0, 27.1), "same", "no need, not distinguishable: lean, 200 px"),  # its own spread counts
+        ((29.0,), None, "no verdict (one seed) in 1 of 1"),
+        ((24.0, 27.0, 27.1), "same", "no need, not distinguishable in 1 of 1"),  # its own spread counts
     ],
 )
 def test_a_verdict_needs_more_than_the_spread_of_seeds(psnrs: tuple[float, ...], verdict: str | None, use: str) -> None:
@@ -249,10 +249,10 @@ def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
         for seed, offset in enumerate(offsets):
             more = {"downscale": downscale, "size": [800 // downscale] * 2}
             runs += [run_of(25 + seed / 10, seed, **more), run_of(25 + offset, seed, "edge", **more)]
-    expected = "yes, better: lean, 200 px; worse: lean, 100 px; not distinguishable: lean, 50 px"
-    assert describe_use(runs, "edge") == f"{expected}; no verdict of one seed: lean, 400 px"
+    expected = "yes, better: lean, 200 px; worse: lean, 100 px; not distinguishable in 1 of 4"
+    assert describe_use(runs, "edge") == f"{expected}; no verdict (one seed) in 1 of 4"
     less = [run for run in runs if run["downscale"] >= 8]
-    assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable: lean, 50 px"
+    assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable in 1 of 2"
     assert describe_use(less, "se") == "–"
 
 

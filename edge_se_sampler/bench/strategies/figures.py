@@ -14,6 +14,8 @@ STYLES = {
     "steps": {"color": "C1", "marker": "D", "label": "equal steps"},
 }
 COLUMNS = 4
+LINEAR_LIMIT = 3
+"""dB: with larger differences, those of trainings that failed, an axis is logarithmic beyond 1 dB."""
 
 
 def draw_differences(runs: list[Run], labels: dict[Panel, str]) -> Any:
@@ -34,6 +36,9 @@ def draw_differences(runs: list[Run], labels: dict[Panel, str]) -> Any:
         axis.set_title(labels[panel], fontsize=9)
         axis.set_yticks(range(len(names)), names, fontsize=8)
         axis.set_ylim(len(names) - 0.5, -0.5)
+        if max(map(abs, axis.dataLim.intervalx)) > LINEAR_LIMIT:
+            axis.set_xscale("symlog", linthresh=1)
+            axis.set_xticks((-10, -1, 0, 1, 10), ("-10", "-1", "0", "1", "10"))
         axis.tick_params(axis="x", labelsize=8)
         style_axes(axis)
     for axis in axes.flat[len(panels) :]:

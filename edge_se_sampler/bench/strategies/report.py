@@ -29,7 +29,7 @@ VERDICTS: dict[Verdict | None, str] = {
     "better": "better",
     "worse": "worse",
     "same": "not distinguishable",
-    None: "no verdict of one seed",
+    None: "no verdict (one seed)",
 }
 """In words; the first that a strategy has anywhere says whether to use it."""
 
@@ -94,12 +94,20 @@ def table_of_claims(runs: list[Run]) -> str:
 def describe_use(runs: list[Run], strategy: str) -> str:
     """The verdicts at equal seconds in words: where it is better than uniform pixels, and where worse."""
     found = _compare_everywhere(runs, strategy)
-    where = {v: [label for label, comparison in found.items() if comparison.verdict == v] for v in VERDICTS}
+    where: dict[Verdict | None, list[str]] = {
+        v: [label for label, comparison in found.items() if comparison.verdict == v] for v in VERDICTS
+    }
     judged = [verdict for verdict in VERDICTS if where[verdict]]
     if not judged:
         return "–"
     answer = {"better": "yes, ", "worse": "no, ", "same": "no need, "}.get(judged[0] or "", "")
-    return answer + "; ".join(f"{VERDICTS[verdict]}: {' and '.join(where[verdict])}" for verdict in judged)
+    places = {
+        verdict: f": {' and '.join(where[verdict])}"
+        if verdict in ("better", "worse")
+        else f" in {len(where[verdict])} of {len(found)}"
+        for verdict in judged
+    }
+    return answer + "; ".join(VERDICTS[verdict] + place for verdict, place in places.items())
 
 
 def _compare_everywhere(runs: list[Run], strategy: str) -> dict[str, Comparison]:
