@@ -23,6 +23,12 @@ from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np.ndarray:
     """Probability of every pixel of the kth view, (H, W); it sums to 1, or to 0 if all pixels are masked."""
+    if type(distribution).strength is Distribution.strength:  # it has tables of its own
+        height, width = batch.sizes[k]
+        pixels = torch.cartesian_prod(torch.tensor([k]), torch.arange(height), torch.arange(width))
+        p = distribution.density_ratio(batch, pixels).reshape(height, width).numpy()
+        p = p if batch.mask is None else p * batch.valid(k).numpy()
+        return p / max(p.sum(), 1e-30)
     table = PixelTable()
     strength = torch.from_numpy(distribution.strength(batch.image(k), batch.background_color))
     table.add([strength if batch.mask is None else strength * batch.valid(k)])

@@ -27,10 +27,12 @@ class SamplingSettings:
     """Which pixels train the network, early and late. Early and late together cover the paper's six strategies."""
 
     early: EarlyStrategy = "edge"
-    """How pixels are drawn in the early phase: uniformly, from the center of the image, or in proportion to edge
-    strength; auto: uniformly where alpha tells where the object is, otherwise by edges under the adaptive schedule."""
+    """How pixels are drawn in the early phase: uniformly, from the center of the image, in proportion to edge
+    strength, or as the errors tell that training found (see sampling/README.md); auto: uniformly where alpha tells
+    where the object is, otherwise by edges under the adaptive schedule."""
     late: LateStrategy = "se"
-    """How pixels are drawn afterwards: uniformly, or by the rank of their squared error among uniform candidates."""
+    """How pixels are drawn afterwards: uniformly, by the rank of their squared error among uniform candidates, or as
+    the errors tell that training found. The same name as early's: all the time."""
     schedule: Literal["fraction", "steps", "adaptive"] = "fraction"
     """What ends the early phase: a share of the planned iterations; a number of steps; or (adaptive, for edges) that
     the object is learnt and edges no longer find larger errors. When either is no longer so, the phase returns."""

@@ -47,10 +47,14 @@ class SoftMining(LearnedDistribution):
 
     def __init__(self, settings: SamplingSettings) -> None:
         super().__init__(settings, SIDE)  # its values stay 1: it draws the uniform tenth
-        self.edges = Edge(replace(settings, edge_epsilon=EDGE_FLOOR))
         self.map = np.zeros(0)  # q by cell; 0: unknown
         self.walkers: dict[int, np.ndarray] = {}  # by image in the table, -1 for all: (n, 4) image, x, q
         self._walking = -1
+
+    def clear(self) -> None:
+        """Give back the memory of the edges' table."""
+        super().clear()
+        self.edges = Edge(replace(self.settings, edge_epsilon=EDGE_FLOOR))
 
     def tables(self, batch: ImageBatch) -> tuple[CellTable, Tensor]:
         """The uniform table, and the index of each image in it."""

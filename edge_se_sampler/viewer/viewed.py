@@ -128,7 +128,8 @@ class Viewed:
         use_mask, background = not sampler.config.ignore_mask, sampler.background_color
         batch = ImageBatch.of(manager.image_batch, use_mask=use_mask, background_color=background)
         distribution, selector = sampler.strategies[sampler.strategy]
-        p = probability_map(distribution, batch, k)
+        with self.turns:  # training changes what a distribution has learnt
+            p = probability_map(distribution, batch, k)
         if isinstance(selector, RankedError):
             errors = self._cached_errors(selector, batch, k)
             errors = squared_error() if errors is None else errors
