@@ -118,6 +118,7 @@ def modules_loaded_by(code: str) -> set[str]:
         ("errors", set()),
         ("protocol", set()),
         ("sampling.random_streams", set()),
+        ("sampling.registry", set()),
         ("sampling.settings", set()),
         ("methods", {"tyro"}),
         ("sampling.edges", {"cv2"}),

@@ -19,7 +19,7 @@ from edge_se_sampler.models.config import (
     NeRFModelConfig,
     SizePreset,
 )
-from edge_se_sampler.protocol import InstantiateConfig
+from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
@@ -89,7 +89,7 @@ class TrainerConfig(InstantiateConfig):
     """Name of the experiment; by default the data folder's name."""
     max_num_iterations: int | None = None
     """Planned iterations, which determine phases and learning rate; by default the model size's."""
-    new_num_iterations: Annotated[int | None, tyro.conf.Suppress] = field(default=None, metadata={"added_later": True})
+    new_num_iterations: Annotated[int | None, tyro.conf.Suppress] = field(default=None, metadata=ADDED_LATER)
     """Planned iterations since `edge-se resume --max-num-iterations`, by which the early phase is no longer."""
     time_budget: str | None = None
     """Train for so long (60, 90s, 10m, 1h) in place of a number of iterations: phases and learning rate follow the
@@ -98,9 +98,9 @@ class TrainerConfig(InstantiateConfig):
     """Iterations of each hundredth of the training; config.json has those of a run with a time budget, to repeat it."""
     max_seconds: float | None = None
     """Stop after so many seconds, even if iterations are left."""
-    patience: int | None = field(default=None, metadata={"added_later": True})
+    patience: int | None = field(default=None, metadata=ADDED_LATER)
     """Stop when the validation view's PSNR has not risen by MIN_GAIN for so many previews; by default never."""
-    min_gain: float = field(default=0.1, metadata={"added_later": True})
+    min_gain: float = field(default=0.1, metadata=ADDED_LATER)
     """dB by which the PSNR must rise above the best so far for --patience to begin anew."""
     steps_per_save: int = 1000
     """Iterations between checkpoints, of which the last two are kept; one is saved at the end and on Ctrl-C too."""

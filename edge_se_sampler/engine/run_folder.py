@@ -167,6 +167,7 @@ def config_to_json(config: TrainerConfig) -> dict[str, Any]:
 def config_digest(config: TrainerConfig) -> str:
     """A hash of every setting that a resumed run must share: not of paths, when to stop, checkpoints and the device."""
     values = config_to_json(config)
+    _drop_added_defaults(config, values)
     for name in ("output_dir", "data", "max_seconds", "steps_per_save", "new_num_iterations", "patience", "min_gain"):
         values.pop(name, None)
     if config.time_budget is not None:
@@ -175,9 +176,22 @@ def config_digest(config: TrainerConfig) -> str:
     return checksum(values)
 
 
+def _drop_added_defaults(config: Any, values: dict[str, Any]) -> None:
+    """Drop the defaults of fields that were added later: earlier versions wrote digests without them."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            _drop_added_defaults(value, values[field.name])
+        elif field.metadata.get("added_later") and value == field.default:
+            del values[field.name]
+
+
 def config_from_json(default: Any, values: Any, where: str) -> Any:
-    """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped."""
+    """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped.
+    Fields that were added later may be missing: they have their defaults."""
     fields = {field.name: field for field in dataclasses.fields(default)}
+    if isinstance(values, dict):
+        values = {name: f.default for name, f in fields.items() if f.metadata.get("added_later")} | values
     if not isinstance(values, dict) or set(values) != set(fields):
         differing = sorted(set(values) ^ set(fields)) if isinstance(values, dict) else "not an object"
         raise InputError(f"{where}: written by another version of edge-se or edited by hand (fields: {differing})")

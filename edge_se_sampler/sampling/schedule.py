@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
 from edge_se_sampler.sampling.background import PlainBackgrounds, summarize_errors
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, SamplerPart, TrainingStep
-
-Phase = Literal["early", "late"]
+from edge_se_sampler.sampling.registry import Phase
 
 REMAINING_TO_END, REMAINING_TO_RETURN = 0.5, 0.8
 """The early phase does not end before R is below the first, and returns when R is above the second (hysteresis)."""
