@@ -19,6 +19,7 @@ from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import load_latest
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, resolve_depths, saved_grid
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import to_pictures
@@ -100,6 +101,7 @@ def prepare_resume(
     trainer = prepare(session_config, run, saved_grid(state["model"]))
     trainer.resume(state, changed_data)
     run.write_config(config)
+    make_folder(run.path / "previews", "RUN")  # which git, for one, leaves out when it is empty
     return trainer
 
 
