@@ -36,9 +36,11 @@ def test_a_run_of_a_format_is_continued(
     assert answer.code == 0, answer.err
     assert f"{STEPS} of {STEPS} iterations" in answer.out
     found, expected = metrics_of(run / "metrics.jsonl"), metrics_of(run / "whole.jsonl")
-    assert [line["step"] for line in found] == [line["step"] for line in expected]
-    for line, whole in zip(found, expected, strict=True):
-        assert line == pytest.approx(whole, rel=0.02)  # another machine rounds differently
+    for key in ("step", "strategy"):
+        assert [line.get(key) for line in found] == [line.get(key) for line in expected]
+    for key in ("loss", "learning_rate", "val_psnr"):  # another machine rounds differently
+        whole = [line[key] for line in expected if key in line]
+        assert [line[key] for line in found if key in line] == pytest.approx(whole, rel=0.02)
     assert json.loads((run / "config.json").read_text())["format"] == FORMAT
     config = RunFolder(run).config(method_configs())
     assert (config.patience, config.steps_per_eval_image) == (None, 5)

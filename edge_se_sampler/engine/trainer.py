@@ -87,14 +87,14 @@ class Trainer:
             self.optimizer.load_state_dict(state["optimizer"])
         self.plan.load_state_dict(state["plan"])
         self.scheduler.load_state_dict(state["scheduler"])
-        self.scheduler.last_epoch -= 1
-        self.scheduler.step()  # again, by the plan as it is now
         if self.dead_network_reset is not None:
             self.dead_network_reset.load_state_dict(state["dead_network_reset"])
         self.early_stopping.load_state_dict(state.get("early_stopping", {}))
         if is_same_data:
             self.pipeline.datamanager.load_state_dict(state["sampler"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
+        for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
+            group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another
         self.run.drop_metrics_after(state["step"])
 
     def train(self) -> None:
@@ -108,7 +108,7 @@ class Trainer:
         with self._interruptible(), Progress(plan.num_steps or 0, config.method_name, self.next_step) as progress:
             while self.next_step != plan.num_steps:
                 step = self.next_step
-                learning_rate = float(self.scheduler.get_last_lr()[0])
+                learning_rate = float(self.optimizer.param_groups[0]["lr"])
                 with self.turns:
                     loss = self.train_iteration(step)
                 self.next_step, self.elapsed = step + 1, time.monotonic() - began
