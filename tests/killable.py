@@ -34,6 +34,7 @@ class KillableCommands:
     def __init__(self, log: Path) -> None:
         """`log` gets a line for every checkpoint and result.json that has been written completely."""
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+        self.log = log
         command = [sys.executable, __file__, str(log)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
@@ -44,6 +45,11 @@ class KillableCommands:
 
     def __exit__(self, *_: object) -> None:
         self._process.communicate()
+
+    def last_saved(self) -> int:
+        """The last step, or number of trials, whose saving had ended since the log was removed; -1: none."""
+        lines = self.log.read_text().splitlines() if self.log.exists() else []
+        return int(lines[-1]) if lines else -1
 
     def run(self, arguments: Sequence[object], seconds: float | None = None) -> int | None:
         """A command's exit code; None: it was killed after so many seconds."""
@@ -56,7 +62,7 @@ class KillableCommands:
 
 @dataclass(frozen=True)
 class ToySettings:
-    size: int = 3000
+    size: int = 1000
 
 
 @dataclass(frozen=True)
@@ -64,15 +70,14 @@ class ToyTrial:
     seed: int
 
 
-def run_toy_bench(folder: Path) -> None:
+def toy_experiment() -> Experiment:
     """An experiment of 12 trials with large runs, which take no time."""
 
     def train(trial: ToyTrial) -> dict[str, Any]:
         return {"values": [trial.seed + i / 7 for i in range(ToySettings().size)]}
 
     trials = [ToyTrial(seed) for seed in range(12)]
-    experiment = Experiment("toy", ToySettings(), lambda _: trials, train, lambda _: ())
-    run_experiment(experiment, folder, lambda: ThreadPoolExecutor(1))
+    return Experiment("toy", ToySettings(), lambda _: trials, train, lambda _: ())
 
 
 def _serve(log: Path) -> None:
@@ -86,6 +91,11 @@ def _serve(log: Path) -> None:
         with suppress(ImportError):
             import_module(name)
     torch.set_num_threads(1)
+    weight = torch.ones(1)
+    weight.grad = torch.ones(1)
+    torch.optim.Adam([weight]).step()  # imports as well
+    torch.save({"w": weight}, buffer := io.BytesIO())
+    torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
     for words in (
         ["train", "edge-se-nerf"],
         ["resume", "."],
@@ -132,7 +142,7 @@ def _run(arguments: list[str]) -> None:
     os.dup2(2, 1)  # standard output is for the answers
     try:
         if arguments[0] == "toy-bench":
-            run_toy_bench(Path(arguments[1]))
+            run_experiment(toy_experiment(), Path(arguments[1]), lambda: ThreadPoolExecutor(1))
         else:
             main(arguments)
         code = 0
