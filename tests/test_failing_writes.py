@@ -20,7 +20,7 @@ from tiny import SMALL
 from edge_se_sampler.bench.runner import read_result, run_experiment
 from edge_se_sampler.errors import InputError
 
-SOME, ALL = 6, pytest.param(None, marks=pytest.mark.slow)
+SOME, ALL = 4, pytest.param(None, marks=pytest.mark.slow)
 
 
 class FailingDisk:
@@ -106,21 +106,25 @@ def test_a_training_goes_on_once_there_is_room(
 ) -> None:
     monkeypatch.setattr("edge_se_sampler.engine.run_folder.find_spec", lambda name: None)  # TensorBoard has threads
     assert edge_se(*train_flags(scene, tmp_path / "disk" / "whole")).code == 0
-    whole = next(tmp_path.glob("disk/whole/*/*/*"))
-    for number in moments(disk.count, some):
+    whole, resumed = next(tmp_path.glob("disk/whole/*/*/*")), 0
+    disk_writes = disk.count
+    for number in moments(disk_writes, some):
         parts = tmp_path / "disk" / f"{number}"
         disk.fail_after(number, [errno.ENOSPC, errno.EROFS, errno.EIO][number % 3])
         answer = edge_se(*train_flags(scene, parts))
         assert (answer.code, answer.err.count("\n")) == (2, 1), (number, answer.err)
         disk.fail_after(None)
+        assert all((path / "config.json").exists() for path in parts.glob("*/*/*"))
         saved = [path.parents[1] for path in parts.glob("*/*/*/checkpoints/*.ckpt")]
         if not saved:
             continue
+        resumed += 1
         state_of(saved[0])
         assert "takes its place" not in (answer := edge_se("resume", saved[0])).err
         assert answer.code == 0, (number, answer.err)
         assert flat(state_of(saved[0])) == flat(state_of(whole))
         assert metrics_of(saved[0]) == metrics_of(whole)
+    print(f"{disk_writes} writes, {resumed} resumed")
 
 
 @pytest.mark.parametrize("some", [2, ALL])
@@ -159,7 +163,8 @@ def test_commands_on_a_run_leave_what_was_there(
         number = number + 1 if some is None else number * 3 + 1
         disk.fail_after(number, [errno.ENOSPC, errno.EROFS, errno.EIO][number % 3])
     disk.fail_after(None)
-    assert not [path for path in tmp_path.rglob("*.tmp")]
+    assert not list(tmp_path.rglob("*.tmp"))
+    print(f"{number} failures")
 
 
 @pytest.mark.parametrize("some", [4, ALL])
@@ -203,20 +208,15 @@ def tmpfs(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
         subprocess.run(["umount", path], check=True)
 
 
-@pytest.mark.parametrize("kilobytes", [8, 64, 128, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kilobytes", [16, 80])
 def test_a_small_file_system_is_filled(kilobytes: int, scene: Path, tmp_path: Path, edge_se, tmpfs) -> None:
     folder = tmpfs(2**10 * kilobytes)
-    (folder / "ballast").write_bytes(bytes(2**12))
     assert edge_se(*train_flags(scene, tmp_path / "whole")).code == 0
     whole = next(tmp_path.glob("whole/*/*/*"))
-    needed = sum(path.stat().st_size for path in whole.rglob("*") if path.is_file())
-    assert needed > 2**10 * kilobytes or kilobytes > 128
     answer = edge_se(*train_flags(scene, folder))
-    if answer.code == 0:
-        assert flat(state_of(next(folder.glob("*/*/*")))) == flat(state_of(whole))
-        return
     assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
     saved = [path.parents[1] for path in folder.glob("*/*/*/checkpoints/*.ckpt")]
+    assert (len(saved) > 0) == (kilobytes > 16)
     if saved:
         before = state_of(saved[0])["step"]
         subprocess.run(["mount", "-o", "remount,size=16m", folder], check=True)

@@ -28,6 +28,7 @@ FEW, MANY = 2, pytest.param(100, marks=pytest.mark.slow)
 @pytest.fixture(scope="module")
 def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KillableCommands]:
     with KillableCommands(tmp_path_factory.mktemp("killable") / "saved") as commands:
+        assert commands.run(["methods"]) == 0  # it has started
         yield commands
 
 
@@ -78,7 +79,7 @@ def test_trainings_survive(
     whole = next(tmp_path.glob("whole/*/*/*"))
     assert commands.run(["eval", whole, "--output-path", tmp_path / "eval.json"]) == 0
     evaluated = json.loads((tmp_path / "eval.json").read_text())["results"]
-    killed = trainings = 0
+    killed = resumed = evaluations = trainings = 0
     while killed < kills:
         parts = tmp_path / f"parts-{trainings}"
         commands.log.unlink(missing_ok=True)
@@ -93,11 +94,13 @@ def test_trainings_survive(
             run = started[0]
             assert state_of(run)["step"] >= commands.last_saved()
             if moments.random() < 0.3:
+                evaluations += 1
                 before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
                 flags = ["--output-path", tmp_path / "eval.json"]
                 killed += commands.run(["eval", run, *flags], moments.uniform(0, 0.3)) is None
                 assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
                 assert json.loads((tmp_path / "eval.json").read_text())["results"].keys() == evaluated.keys()
+            resumed += 1
             code = commands.run(["resume", run], moments.uniform(0.05, seconds))
         assert code == 0
         (run,) = (path.parents[1] for path in parts.glob(f"*/*/*/checkpoints/step-{STEPS - 1:09d}.ckpt"))
@@ -106,7 +109,7 @@ def test_trainings_survive(
         trainings += 1
         shutil.rmtree(parts)
     assert "takes its place" not in capfd.readouterr().err  # the newest was never damaged
-    print(f"{killed} kills of {trainings} trainings")
+    print(f"{killed} kills, {resumed} resumed, {evaluations} evaluations, {trainings} trainings that ended")
 
 
 @pytest.mark.parametrize("kills", [FEW, MANY])

@@ -37,15 +37,14 @@ class RunFolder:
         parent = config.output_dir / str(config.experiment_name) / config.method_name
         with os_errors_as_input_errors(f"--output-dir {config.output_dir}: cannot be written"):
             parent.mkdir(parents=True, exist_ok=True)
-            path = _new_folder(parent, time.strftime("%Y-%m-%d_%H%M%S"))
-            (path / "checkpoints").mkdir()
-            (path / "previews").mkdir()
-        run = cls(path)
-        try:
-            run.write_config(config)
-        except InputError:
-            shutil.rmtree(path, ignore_errors=True)
-            raise
+            run = cls(_new_folder(parent, time.strftime("%Y-%m-%d_%H%M%S")))
+            try:
+                (run.path / "checkpoints").mkdir()
+                (run.path / "previews").mkdir()
+                run.write_config(config)
+            except (OSError, InputError):
+                shutil.rmtree(run.path, ignore_errors=True)
+                raise
         return run
 
     def write_config(self, config: TrainerConfig) -> None:
