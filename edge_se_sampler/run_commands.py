@@ -55,15 +55,19 @@ class _RunCommand:
 
 @dataclass(frozen=True)
 class Resume(_RunCommand):
-    """Continue an interrupted run in place, under its own settings."""
+    """Continue an interrupted run in place, under its own settings, or extend a finished one."""
 
     max_seconds: float | None = None
     """Stop this session after so many seconds."""
+    max_num_iterations: int | None = None
+    """Planned iterations from now on, which the learning rate follows; the early phase keeps its length."""
+    changed_data: bool = False
+    """Train on, although the training images are not those that the run began with."""
 
     def run(self) -> None:
         from edge_se_sampler.engine.session import prepare_resume
 
-        train(prepare_resume(*self._load(), self.max_seconds))
+        train(prepare_resume(*self._load(), self.max_seconds, self.max_num_iterations, self.changed_data))
 
 
 @dataclass(frozen=True)
@@ -159,6 +163,9 @@ def train(trainer: Any) -> None:
         print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
         sys.exit(130)
     print(f"{trainer.next_step} of {trainer.plan.num_steps or '?'} iterations in {trainer.elapsed:.1f} s of training")
+    stopping = trainer.early_stopping
+    if stopping.is_due:
+        print(f"stopped: no gain of {stopping.min_gain:g} dB in the last {stopping.patience} previews")
     print(f"measure it: edge-se eval {trainer.run.path}")
     if trainer.next_step != trainer.plan.num_steps:
         print(f"continue:   {resume}")

@@ -18,10 +18,12 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.bench.runner import (
+    VERSION,
     Experiment,
     Run,
     executor_factory,
     list_trials,
+    read_result,
     run_experiment,
     run_in_subprocess,
 )
@@ -68,9 +70,9 @@ def read(folder: Path) -> dict[str, Any]:
 
 def test_result_json_holds_the_head_and_every_run_sorted(tmp_path: Path) -> None:
     result = run_experiment(toy_experiment(trials=lambda _: TRIALS[::-1]), tmp_path / "new", one_thread)
-    assert read(tmp_path / "new") == json.loads(json.dumps(result))
+    assert read_result(tmp_path / "new" / "result.json") == json.loads(json.dumps(result))
     assert result["runs"] == [{"scene": "mic", "seed": seed, "psnr": 20.0 + seed} for seed in range(3)]
-    assert (result["version"], result["experiment"], result["settings"]) == (2, "toy", {"steps": 3})
+    assert (result["version"], result["experiment"], result["settings"]) == (VERSION, "toy", {"steps": 3})
     assert result["command"].startswith("edge-se ")
     assert result["errors"] == []
 

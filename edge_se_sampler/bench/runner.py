@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.engine.files import make_folder, write_atomically
+from edge_se_sampler.engine.files import checksum, make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 
-VERSION = 2
+VERSION = 3
+"""Of results. Version 2, which is read as well, has no checksum."""
 MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
@@ -101,23 +102,29 @@ def _command() -> str:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A result.json; InputError if it cannot be read, or is no result of this version."""
+    """A result.json; InputError if it cannot be read, is no result of this version or the one before, or is not as it
+    was written."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-        if result["version"] != VERSION:
+        claimed = result.pop("checksum", None)
+        if result["version"] not in (2, VERSION):
             raise ValueError(f"version {result['version']}, not {VERSION}")
+        if claimed != (None if result["version"] == 2 else checksum(result)):
+            raise ValueError("changed since it was written (checksum)")
         if not {"experiment", "command", "settings", "machine"} <= result.keys():
             raise KeyError("experiment, command, settings or machine")
         if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
             raise TypeError("runs and errors are lists of objects")
-    except (OSError, ValueError, KeyError, TypeError) as problem:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
         raise InputError(f"{path}: not a result of edge-se bench ({problem!r})") from problem
     return result
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
     """result.json, every run on a line of its own; InputError if it cannot be written."""
-    head = json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=1, allow_nan=False)
+    result = {**result, "version": VERSION}
+    head = {key: value for key, value in result.items() if key != "runs"} | {"checksum": checksum(result)}
+    head = json.dumps(head, indent=1, allow_nan=False)
     runs = ",\n".join(json.dumps(run, allow_nan=False) for run in result["runs"])
     write_atomically(path, f'{head[:-2]},\n "runs": [\n{runs}\n ]\n}}\n'.encode())
 

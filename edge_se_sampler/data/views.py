@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -38,6 +39,16 @@ class Views:
         if self.masks is not None:
             masks = [mask & own for mask, own in zip(masks, self.masks, strict=True)]
         return replace(self, masks=tuple(masks))
+
+    def digest(self) -> str:
+        """A hash of images, masks and cameras, the latter as single precision holds them."""
+        digest = hashlib.sha256()
+        for array in (*self.images, *(self.masks or ())):
+            digest.update(f"{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array))
+        for values in vars(self.cameras).values():
+            digest.update(values.float().numpy().tobytes())
+        return digest.hexdigest()
 
     def describe(self) -> str:
         """How many views of which sizes there are, and what their alpha and masks mean, in a line."""

@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +16,9 @@ import torch
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.checkpoint import load_latest
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, resolve_depths, saved_grid
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import to_pictures
@@ -36,6 +38,9 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     views, device = read_train_views(config), choose_device(config.machine.device_type)
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else to_pictures(held_out)[0]
+    check_value(
+        "patience", config.patience, config.patience is None or preview is not None, "left out: no view is held out"
+    )
     began = time.monotonic()
     config = resolve_config(config, views)
     setup_seconds = time.monotonic() - began
@@ -77,20 +82,40 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     return resolved
 
 
-def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
-    """Continue an interrupted run under its own settings, but for max_seconds; InputError for a bad run or data."""
-    config = replace(config, max_seconds=max_seconds)
-    config.check()
-    state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
-    trainer = prepare(config, run, saved_grid(state["model"]))
-    trainer.resume(state)
+def prepare_resume(
+    run: RunFolder,
+    config: TrainerConfig,
+    max_seconds: float | None = None,
+    max_num_iterations: int | None = None,
+    changed_data: bool = False,
+) -> Trainer:
+    """Continue a run under its own settings, but for max_seconds, and max_num_iterations if that is given: what a
+    finished one then goes on with is its optimizer's state. InputError for a bad run or data, and for training images
+    that have changed, unless that is accepted; what the sampler remembers of them is then forgotten."""
+    _, state = load_latest(run.checkpoints, config_digest(config))
+    if max_num_iterations is not None:
+        config = _extend(config, state, max_num_iterations)
+    session_config = replace(config, max_seconds=max_seconds)
+    session_config.check()
+    trainer = prepare(session_config, run, saved_grid(state["model"]))
+    trainer.resume(state, changed_data)
+    run.write_config(config)
+    make_folder(run.path / "previews", "RUN")  # which git, for one, leaves out when it is empty
     return trainer
+
+
+def _extend(config: TrainerConfig, state: dict[str, Any], num_iterations: int) -> TrainerConfig:
+    """The config of a run that is to have so many iterations in all; InputError if it cannot have them."""
+    flag, done = "max-num-iterations", state["step"] + 1
+    check_value(flag, num_iterations, num_iterations > done, f"above {done}, the iterations that are done")
+    check_value(flag, num_iterations, config.max_num_iterations is not None, "left out: this run's length is a time")
+    check_value(flag, num_iterations, state["optimizer"] is not None, "left out: this run ended without its optimizer")
+    return replace(config, new_num_iterations=num_iterations)
 
 
 def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     """A run's model with the weights of its last checkpoint, and that checkpoint; InputError if it is bad."""
-    checkpoint = latest_checkpoint(run.checkpoints)
-    state = load_checkpoint(checkpoint, config_digest(config))
+    checkpoint, state = load_latest(run.checkpoints, config_digest(config))
     model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
     load_weights(model, state["model"])
     return model, checkpoint

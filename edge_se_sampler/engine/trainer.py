@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.early_stopping import EarlyStopping
 from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.optimizers import create_adam, learning_rate_factor
 from edge_se_sampler.engine.pipeline import Pipeline, load_weights
@@ -25,6 +26,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
 from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
@@ -43,7 +45,9 @@ class Trainer:
         setup_seconds: float = 0.0,
     ) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
-        self.plan = Plan(config.max_num_iterations, config.segments or (), config.budget_seconds)
+        num_steps = config.new_num_iterations or config.max_num_iterations
+        self.plan = Plan(num_steps, config.segments or (), config.budget_seconds)
+        self.early_stopping = EarlyStopping(config.patience, config.min_gain)
         self.setup_seconds = setup_seconds
         self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset, config.optimizer)
         self.scheduler = LambdaLR(self.optimizer, self._learning_rate_factor)
@@ -70,21 +74,30 @@ class Trainer:
     def _learning_rate_factor(self, step: int) -> float:
         return learning_rate_factor(self.config.optimizer, self.progress(step), step)
 
-    def resume(self, state: dict[str, Any]) -> None:
-        """Continue from a checkpoint's state; InputError if it is another model's."""
+    def resume(self, state: dict[str, Any], changed_data: bool = False) -> None:
+        """Continue from a checkpoint's state; InputError if it is another model's, or, unless that is accepted, of
+        other training images. What the sampler remembers of others is forgotten."""
+        is_same_data = state.get("data_digest", self.pipeline.data_digest) == self.pipeline.data_digest
+        if not (is_same_data or changed_data):
+            remedy = "restore them, or add --changed-data True"
+            raise InputError(f"{self.config.data}: not the training images that the run began with; {remedy}")
         load_weights(self.pipeline.model, state["model"])
-        if state["optimizer"] is not None:  # of a run that has ended
+        if state["optimizer"] is not None:  # format 2 had none in a run that has ended
             self.optimizer.load_state_dict(state["optimizer"])
         self.plan.load_state_dict(state["plan"])
         self.scheduler.load_state_dict(state["scheduler"])
         if self.dead_network_reset is not None:
             self.dead_network_reset.load_state_dict(state["dead_network_reset"])
-        self.pipeline.datamanager.load_state_dict(state["sampler"])
+        self.early_stopping.load_state_dict(state.get("early_stopping", {}))
+        if is_same_data:
+            self.pipeline.datamanager.load_state_dict(state["sampler"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
+        for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
+            group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another
         self.run.drop_metrics_after(state["step"])
 
     def train(self) -> None:
-        """Train until the planned iterations are done, max_seconds have passed, or Ctrl-C; then save.
+        """Train until the planned iterations are done, max_seconds have passed, patience is lost, or Ctrl-C; then save.
         FloatingPointError if the loss or a weight is not finite: the last checkpoint is kept."""
         config = self.config
         began = time.monotonic() - self.elapsed
@@ -94,7 +107,7 @@ class Trainer:
         with self._interruptible(), Progress(plan.num_steps or 0, config.method_name, self.next_step) as progress:
             while self.next_step != plan.num_steps:
                 step = self.next_step
-                learning_rate = float(self.scheduler.get_last_lr()[0])
+                learning_rate = float(self.optimizer.param_groups[0]["lr"])
                 with self.turns:
                     loss = self.train_iteration(step)
                 self.next_step, self.elapsed = step + 1, time.monotonic() - began
@@ -108,6 +121,7 @@ class Trainer:
                     with self.turns:
                         self._preview(step)
                     began = time.monotonic() - self.elapsed  # a preview is not training time
+                    stop = stop or self.early_stopping.is_due
                 if stop or self.next_step % config.steps_per_save == 0:
                     self.save()
                 total = plan.num_steps or round(self.next_step / max(plan.progress(self.next_step), 1e-3))
@@ -168,7 +182,6 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of the steps done so far; FloatingPointError, and no file, if a weight is not finite."""
         step = self.next_step - 1
-        ended = self.next_step == self.plan.num_steps
         extremes = [
             torch.stack(torch.aminmax(weight)) for weight in self.pipeline.model.parameters()
         ]  # needs no memory
@@ -180,10 +193,12 @@ class Trainer:
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
             "plan": self.plan.state_dict(),
-            "optimizer": None if ended else self.optimizer.state_dict(),  # as large as the model, twice
+            "optimizer": self.optimizer.state_dict(),
             "scheduler": self.scheduler.state_dict(),
             "dead_network_reset": None if self.dead_network_reset is None else self.dead_network_reset.state_dict(),
             "sampler": self.pipeline.datamanager.state_dict(),
+            "early_stopping": self.early_stopping.state_dict(),
+            "data_digest": self.pipeline.data_digest,
         }
         save_checkpoint(self.run.checkpoints, step, state)
 
@@ -203,6 +218,7 @@ class Trainer:
     def _preview(self, step: int) -> None:
         if self.preview_picture is not None:
             rendered, self._preview_psnr = render_view(self.pipeline.model, self.preview_picture)
+            self.early_stopping.update(self._preview_psnr)
             self._record(step, val_psnr=self._preview_psnr)
             write_image(self.run.path / "previews" / f"step-{step:09d}.png", rendered)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from threading import Condition
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_latest
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.metrics import composite_on
@@ -56,24 +57,28 @@ class Viewed:
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
         self.turns = trainer.turns = Turns()
+        self._newest: Path | None = None  # checkpoint that was looked at, whole or not
 
     @classmethod
     def load(cls, run: RunFolder, config: TrainerConfig) -> Viewed:
         """A run at its last checkpoint; nothing is written. InputError for a bad run or data."""
-        state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
+        newest = latest_checkpoint(run.checkpoints)
+        _, state = load_latest(run.checkpoints, config_digest(config))
         device, views = choose_device(config.machine.device_type), read_train_views(config)
         pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
         load_weights(pipeline.model, state["model"])
         viewed = cls(config.setup(run=run, pipeline=pipeline, preview=None))
         viewed._take(state, pipeline.model)
+        viewed._newest = newest
         return viewed
 
     def reload(self) -> None:
         """Show a newer checkpoint if another process has written one; InputError if it cannot be read."""
         trainer = self.trainer
-        path = latest_checkpoint(trainer.run.checkpoints)
-        if path.stem != f"step-{trainer.next_step - 1:09d}":
-            state = load_checkpoint(path, config_digest(trainer.config))
+        newest = latest_checkpoint(trainer.run.checkpoints)
+        if newest != self._newest:
+            self._newest = newest
+            _, state = load_latest(trainer.run.checkpoints, config_digest(trainer.config))
             model = build_model(trainer.config, str(trainer.pipeline.model.device), saved_grid(state["model"]))
             load_weights(model, state["model"])
             self._take(state, model)
