@@ -17,7 +17,7 @@ from edge_se_sampler.data.config import Masks
 from edge_se_sampler.data.downscale import average_pixels, shrink_mask
 from edge_se_sampler.data.image_file import ImageHeader, read_header, read_image, turn_upright
 from edge_se_sampler.data.lens import Intrinsics, find_pinhole, find_sources, undistort
-from edge_se_sampler.data.memory import check_memory, num_workers
+from edge_se_sampler.data.memory import ModelMemory, check_memory, num_workers
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
@@ -57,6 +57,8 @@ class LoadSettings:
     """What a mask file means: pixels outside are unknown and ignored, or not of the object, which is alpha."""
     downscale: int = 1
     """Every so many pixels along both axes become one."""
+    model_memory: ModelMemory = lambda longest: 0
+    """What training takes of memory beside them."""
 
 
 def read_headers(files: Sequence[SourceFile]) -> list[ImageHeader]:
@@ -89,7 +91,7 @@ def load_views(
     listing = SourceLocation(frames[0].image.location.file)
     for frame in frames:
         _check_size(frame, settings.downscale)
-    check_memory(_sizes(frames), settings.downscale, listing)
+    memory = check_memory(_sizes(frames), settings.downscale, settings.model_memory, listing)
     largest = max(frame.header.width * frame.header.height for frame in frames)
     images, masks = [], []
     with ThreadPoolExecutor(num_workers(largest)) as pool:  # decoders and numpy release Python's lock
@@ -107,7 +109,8 @@ def load_views(
             frames_field = replace(location, field=location.field.partition("[")[0])
             raise frames_field.error("all pixels of all views are masked", "masks are non-zero where to train")
     names = tuple(frame.name for frame in frames)
-    return Views(names, tuple(images), tuple(masks) if has_masks else None, _cameras(frames, settings.downscale))
+    cameras = _cameras(frames, settings.downscale)
+    return Views(names, tuple(images), tuple(masks) if has_masks else None, cameras, memory=memory)
 
 
 def _sizes(frames: Sequence[Frame]) -> np.ndarray:

@@ -11,6 +11,7 @@ from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
+from edge_se_sampler.models.lean import BYTES_PER_ROW, ROWS_PER_PIXEL
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis
 from edge_se_sampler.sampling.edges import unit_float
 
@@ -20,7 +21,7 @@ NUM_VIEWS = 3  # in the picture
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     """What is derived from training views, one finding a line; draws it too. InputError for bad settings or outputs."""
     pyplot = require_pyplot()
-    config, depth_source = resolve_depths(views, decide_size(config, views.images))
+    config, depth_source = resolve_depths(views, decide_size(config, views.longest_side))
     config.check()
     analysis = analyze_views(views, config)
     hull, hit_pixels = analysis.hull, analysis.hit_pixels
@@ -64,6 +65,7 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
     return {
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
         "data": views.describe(),
+        "memory": views.memory or "not known of views that were made in memory",
         "depths": f"{config.near:g} to {config.far:g}, by {depth_source}",
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
@@ -72,6 +74,8 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)",
         "levels": f"what training sees is subdivided {analysis.max_level} times, to about {config.voxel_size_px:g} "
         f"pixels, as what was seen and {config.max_memory:.1f} GiB allow",
+        "rows": f"of corners and cells {config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million at most, by memory; "
+        f"{ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million at most are learned from what the images show",
         "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
         "longer side",
         "rays": f"{100 * share:.1f} % of the pixels may cross these cells",
