@@ -193,6 +193,8 @@ class Masks:
 
     data: Path
     """Folder of images and cameras; the masks are written into it, as `masks/` or beside images_2 as `masks_2/`."""
+    out: Path | None = None
+    """Write `masks/` into this folder instead, where --data may not be written to."""
     data_format: DataFormat = "auto"
     """Insist on a format where a folder has several."""
     output_path: Path = Path("masks.png")
@@ -202,7 +204,7 @@ class Masks:
         from edge_se_sampler.data.dataset import DataSettings
         from edge_se_sampler.masks.command import make_masks
 
-        print(make_masks(self.data, DataSettings(self.data_format), self.output_path))
+        print(make_masks(self.data, DataSettings(self.data_format), self.output_path, self.out))
 
 
 @dataclass(frozen=True)

@@ -137,9 +137,7 @@ def _training_memory(config: TrainerConfig, longest: int) -> int:
     return decide_size(config.pipeline.model, longest).training_memory
 
 
-def _read_split(
-    config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda longest: 0
-) -> Views | None:
+def _read_split(config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda longest: 0) -> Views | None:
     assert config.data is not None
     settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory)
     with Progress(0, "reading images") as progress:
