@@ -123,10 +123,26 @@ def test_orientations_that_may_mean_either_are_refused(tmp_path: Path) -> None:
 
 def test_more_than_the_machine_has_is_refused_before_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_transforms(tmp_path)
-    monkeypatch.setattr(memory, "available_memory", lambda: 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + 20))
+    monkeypatch.setattr(memory, "MIN_SIDE", 8)
     monkeypatch.setattr("edge_se_sampler.data.frames.read_image", None)  # would not be callable
-    with pytest.raises(InputError, match=r"transforms\.json: its 7 images take .*; give --downscale 3"):
-        read(tmp_path)
+    third = 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + 20)
+    for available, of_pixel, remedy in (
+        (third, 0, "give --downscale 3"),
+        (third, 200, "give --downscale 4"),  # the model's is in proportion to the longest side
+        (third // 100, 0, "give fewer images"),
+        (third, third, "train a smaller model"),
+    ):
+        monkeypatch.setattr(memory, "available_memory", lambda available=available: available)
+        with pytest.raises(InputError, match=rf"transforms\.json: training on its 7 images takes .*; {remedy}"):
+            read(tmp_path, model_memory=lambda longest, of_pixel=of_pixel: of_pixel * longest)
+
+
+def test_what_training_takes_is_known_of_views_that_were_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_transforms(tmp_path)
+    monkeypatch.setattr(memory, "available_memory", lambda: 3 * 2**30)
+    of_model = read(tmp_path, model_memory=lambda longest: longest * 2**23).subset([0, 2])
+    assert of_model.memory == "images 0.1 MiB, tables 0.2 MiB, model up to 0.4 GiB; 3.0 GiB available"
+    assert read(tmp_path, downscale=2).memory == "images 0.0 MiB, tables 0.1 MiB; 3.0 GiB available"
 
 
 @pytest.mark.parametrize(("limit", "expected"), [("1000", 700), ("400", 100), ("max", None)])

@@ -27,7 +27,7 @@ Progress = Callable[[int, int], None]
 MAX_REMAPPED = 2**15 - 2
 """Pixels, of a side: OpenCV undistorts no larger images."""
 MIN_FOCAL, MAX_FOCAL = 0.01, 1e4
-"""Focal lengths of cameras, in longer sides of their images: of a field of view of 179 degrees, and of 20 arc seconds."""
+"""Focal lengths of cameras, in longer sides of their images: fields of view of 178 degrees, and of 20 arc seconds."""
 MAX_OFFSET = 100.0
 """Of a principal point from the center, in the larger of the image's longer side and the focal length."""
 MAX_POSITION, MAX_REMOVAL = 1e15, 1e5
@@ -194,7 +194,7 @@ def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     header = choose_orientation(
         file, read_header(file), lambda header: (header.width, header.height) == (width, height)
     )
-    colors = turn_upright(read_image(file), header.orientation)[..., :3]  # without alpha: opaque black masks as well
+    colors = turn_upright(read_image(file), header.orientation)[..., :3]  # without alpha: an opaque black mask masks
     if colors.shape[:2] != (height, width):
         problem = f"is {colors.shape[1]} x {colors.shape[0]} pixels, its image {width} x {height}"
         raise file.error(problem, "give the mask the size of its image")

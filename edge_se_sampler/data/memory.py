@@ -42,8 +42,8 @@ class MemoryNeeds:
         return self.images + self.tables + self.model
 
     def __str__(self) -> str:
-        parts = [f"images {_to_gib(self.images)}", f"tables {_to_gib(self.tables)}"]
-        return ", ".join(parts + [f"model up to {_to_gib(self.model)}"] * (self.model > 0))
+        parts = [f"images {_format(self.images)}", f"tables {_format(self.tables)}"]
+        return ", ".join(parts + [f"model up to {_format(self.model)}"] * (self.model > 0))
 
 
 def num_workers(num_pixels: int) -> int:
@@ -92,10 +92,10 @@ def check_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, l
     if available is None:
         return str(needed)
     if needed.total <= available:
-        return f"{needed}; {_to_gib(available)} available"
-    problem = f"training on its {len(sizes)} images takes {_to_gib(needed.total)} of memory ({needed})"
+        return f"{needed}; {_format(available)} available"
+    problem = f"training on its {len(sizes)} images takes {_format(needed.total)} of memory ({needed})"
     remedy = _find_remedy(sizes, downscale, model_memory, available)
-    raise location.error(f"{problem}, {_to_gib(available)} are available", remedy)
+    raise location.error(f"{problem}, {_format(available)} are available", remedy)
 
 
 def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory) -> MemoryNeeds:
@@ -114,5 +114,6 @@ def _find_remedy(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, a
     return "give fewer images" if largest.model <= available else "train a smaller model"
 
 
-def _to_gib(size: int) -> str:
-    return f"{size / 2**30:,.1f} GiB"
+def _format(size: int) -> str:
+    gib = min(size, 2**100) / 2**30
+    return f"{gib:,.1f} GiB" if gib >= 0.1 else f"{1024 * gib:.1f} MiB"

@@ -74,8 +74,8 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)",
         "levels": f"what training sees is subdivided {analysis.max_level} times, to about {config.voxel_size_px:g} "
         f"pixels, as what was seen and {config.max_memory:.1f} GiB allow",
-        "rows": f"of corners and cells {config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million at most, by memory; "
-        f"{ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million at most are learned from what the images show",
+        "corners": f"of cells, at most {config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million by memory, and "
+        f"{ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million by the pixels that show something",
         "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
         "longer side",
         "rays": f"{100 * share:.1f} % of the pixels may cross these cells",
