@@ -20,6 +20,7 @@ from capture_folder import (
     Distortion,
     picture,
     read,
+    turned_jpeg,
     write_colmap,
     write_transforms,
 )
@@ -89,12 +90,6 @@ def test_rays_of_downscaled_images(tmp_path: Path) -> None:
     )
 
 
-def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
-    data = iio.imwrite("<bytes>", image, extension=".jpg", quality=100)
-    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
-
-
 @pytest.mark.parametrize(("orientation", "stored"), [
     (6, lambda image: np.rot90(image)), (8, lambda image: np.rot90(image, -1)),
     (5, lambda image: image.swapaxes(0, 1)), (7, lambda image: np.rot90(image, 2).swapaxes(0, 1)),
@@ -102,7 +97,7 @@ def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
 def test_orientations_are_applied_where_the_size_says_so(orientation: int, stored: Any, tmp_path: Path) -> None:
     write_colmap(tmp_path)
     for i, name in enumerate(NAMES):
-        write_turned(tmp_path / "images" / name, stored(picture(i)), orientation)
+        (tmp_path / "images" / name).write_bytes(turned_jpeg(stored(picture(i)), orientation))
     difference = read(tmp_path).images[0].astype(int) - picture(1)
     assert np.abs(difference).mean() < 4  # JPEG's
 
@@ -110,14 +105,32 @@ def test_orientations_are_applied_where_the_size_says_so(orientation: int, store
 def test_orientations_that_the_camera_ignored(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     for i, name in enumerate(NAMES):
-        write_turned(tmp_path / "images" / name, picture(i), 6)
+        (tmp_path / "images" / name).write_bytes(turned_jpeg(picture(i), 6))
     assert np.abs(read(tmp_path).images[0].astype(int) - picture(1)).mean() < 4
 
 
 def test_orientations_that_may_mean_either_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path)
-    write_turned(tmp_path / "images" / NAMES[3], picture(3), 3)
+    (tmp_path / "images" / NAMES[3]).write_bytes(turned_jpeg(picture(3), 3))
     with pytest.raises(InputError, match=r"images\[3\]: .*EXIF orientation 3"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("turned_image", [False, True])
+def test_a_masks_own_orientation_is_applied(turned_image: bool, tmp_path: Path) -> None:
+    """Whether or not its image has one."""
+    write_colmap(tmp_path)
+    if turned_image:
+        (tmp_path / "images" / NAMES[1]).write_bytes(turned_jpeg(np.rot90(picture(1)), 6))
+    (tmp_path / "masks").mkdir()
+    mask = tmp_path / "masks" / NAMES[1]
+    mask.write_bytes(turned_jpeg(np.rot90(half_mask()), 6))
+    masks = read(tmp_path).masks
+    assert masks is not None
+    assert masks[0][:, :20].all()  # JPEG's blocks blur the edge between
+    assert not read(tmp_path, masks="object").images[0][:, 32:, 3].any()
+    mask.write_bytes(turned_jpeg(half_mask(), 3))
+    with pytest.raises(InputError, match=r"images\[1\]: .*EXIF orientation 3"):
         read(tmp_path)
 
 
