@@ -15,7 +15,8 @@ from edge_se_sampler.models.lean import BYTES_PER_ROW, ROWS_PER_PIXEL
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis
 from edge_se_sampler.sampling.edges import unit_float
 
-NUM_VIEWS = 3  # in the picture
+NUM_VIEWS, NUM_AXES = 3, 12
+"""Of the images, and of the cameras' optical axes, in the picture."""
 
 
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
@@ -28,17 +29,23 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
     ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
     poses = views.cameras.camera_to_worlds.numpy()
-    sampled = poses[:, :, 3] - np.multiply.outer(config.depths, poses[:, :, 2])  # optical axes, from near to far
+    some = poses[:: -(-len(poses) // NUM_AXES)]
+    sampled = some[:, :, 3] - np.multiply.outer(config.depths, some[:, :, 2])  # optical axes, from near to far
     for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
         right, up = (other for other in range(3) if other != along)
         extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
-        axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6, zorder=-2)
-        axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3, zorder=-1)
+        axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6)
+        axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3)
         axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
         axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
         axis.autoscale()
     lines = axes[0, 0].lines
-    figure.legend([lines[-1], lines[0]], ["cameras", "depths at which rays are sampled"], ncols=2, loc="upper center")
+    figure.legend(
+        [lines[-1], lines[0]],
+        ["cameras", "depths at which some cameras' rays are sampled"],
+        ncols=2,
+        loc="upper center",
+    )
     chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
     axes[1, 1].set_xlabel("dark: pixels whose rays miss these cells")
     for axis, k in zip(axes[1], chosen, strict=True):
@@ -74,8 +81,8 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)",
         "levels": f"what training sees is subdivided {analysis.max_level} times, to about {config.voxel_size_px:g} "
         f"pixels, as what was seen and {config.max_memory:.1f} GiB allow",
-        "corners": f"of cells, at most {config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million by memory, and "
-        f"{ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million by the pixels that show something",
+        "corners": f"{config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million of cells fit into that; the images "
+        f"show enough to learn {ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million",
         "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
         "longer side",
         "rays": f"{100 * share:.1f} % of the pixels may cross these cells",
