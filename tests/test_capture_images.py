@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from edge_se_sampler.data import memory
 from edge_se_sampler.data.lens import find_sources
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.nerf import NeRFModel
 
 
 def half_mask() -> np.ndarray:
@@ -156,6 +159,31 @@ def test_what_training_takes_is_known_of_views_that_were_read(tmp_path: Path, mo
     of_model = read(tmp_path, model_memory=lambda longest: longest * 2**23).subset([0, 2])
     assert of_model.memory == "images 0.1 MiB, tables 0.2 MiB, model up to 0.4 GiB; 3.0 GiB available"
     assert read(tmp_path, downscale=2).memory == "images 0.0 MiB, tables 0.1 MiB; 3.0 GiB available"
+
+
+@pytest.mark.parametrize("size", ["paper", "small", "tiny"])
+def test_weights_and_their_moments_are_in_the_estimate(size: Any) -> None:
+    config = NeRFModelConfig(size=size)
+    weights = sum(weight.numel() for weight in NeRFModel(config, np.random.default_rng(0)).parameters())
+    of_points = 2 * 4 * config.preset.width * (config.preset.depth + 2) * 2**14
+    assert 16 * weights < config.training_memory - of_points < 1.5 * 16 * weights
+
+
+def test_train_and_inspect_say_what_training_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edge_se: Any
+) -> None:
+    write_transforms(tmp_path / "scene")
+    monkeypatch.setattr(memory, "available_memory", lambda: 3 * 2**30)
+    flags = ["--data", tmp_path / "scene"]
+    training = ["--output-dir", tmp_path, "--max-num-iterations", "1", "--machine.device-type", "cpu"]
+    answers = [
+        edge_se("inspect", *flags, "--output-path", tmp_path / "x.png"),
+        edge_se("train", "lean-nerf", *flags, *training),
+    ]
+    found = [re.search(r"^memory +(.*)$", answer.out, re.MULTILINE) for answer in answers]
+    assert [match and match[1] for match in found] == [
+        "images 0.1 MiB, tables 0.2 MiB, model up to 0.2 GiB; 3.0 GiB available"
+    ] * 2
 
 
 @pytest.mark.parametrize(("limit", "expected"), [("1000", 700), ("400", 100), ("max", None)])
