@@ -64,6 +64,7 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
     hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.box.pixel_footprint
     num_views, num_occupied = len(views.images), hull.cells.sum()
     sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
+    assert config.max_memory is not None  # the config is resolved
     # large cells may reach beyond the box
     num_cells = max(hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3)
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
