@@ -175,6 +175,18 @@ def test_the_command_writes_what_readers_find(
     assert outlined.shape == (600, 1200, 3)
     assert (outlined == (230, 40, 40)).all(axis=2).any()
 
+    moved = folder.rename(tmp_path / "moved")
+    elsewhere = tmp_path / "elsewhere"
+    (moved / "masks").rename(tmp_path / "expected")
+    answer = edge_se("masks", "--data", moved, "--out", elsewhere, "--output-path", tmp_path / "masks.png")
+    assert answer.code == 0
+    assert f"copy what is in {elsewhere} into {moved}" in answer.out
+    assert sorted(path.name for path in moved.iterdir()) == ["images", "transforms.json"]
+    for path in (tmp_path / "expected").iterdir():
+        assert (elsewhere / "masks" / path.name).read_bytes() == path.read_bytes()
+    (tmp_path / "expected").rename(moved / "masks")
+    folder, command = moved, ["masks", "--data", moved, "--output-path", tmp_path / "masks.png"]
+
     before = {path: path.read_bytes() for path in (folder / "masks").iterdir()}
     answer = edge_se(*command)
     assert answer.code == 2

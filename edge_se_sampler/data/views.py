@@ -26,6 +26,12 @@ class Views:
     depths: tuple[float, float] | None = NERF_SYNTHETIC_DEPTHS  # near and far by the format; None: it has none
     data_format: str | None = None  # None: made in memory
     eval_every: int | None = None  # every how many images one is held out; None: the data has a split
+    memory: str = ""  # what training on them takes of memory, as estimated before they were read; "": it was not
+
+    @property
+    def longest_side(self) -> int:
+        """Of all images, in pixels."""
+        return max(max(image.shape[:2]) for image in self.images)
 
     def subset(self, indices: Sequence[int]) -> Views:
         """The views of these indices, in this order."""

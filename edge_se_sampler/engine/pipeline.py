@@ -35,6 +35,8 @@ class Pipeline:
     """What the training views are, in a line."""
     data_digest: str = ""
     """Of the training views."""
+    memory_summary: str = ""
+    """What training was estimated to take of memory, in a line; "": that is not known."""
     hull: Hull | None = None
     """The cells with which training begins; None: the model has no grid."""
 
@@ -58,7 +60,8 @@ class Pipeline:
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
         datamanager = manager_config.setup(views=views, device=device, background_color=background)
-        return cls(datamanager, build_model(config, device, saved_grid or grid), summary, digest, hull)
+        model = build_model(config, device, saved_grid or grid)
+        return cls(datamanager, model, summary, digest, views.memory, hull)
 
 
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:

@@ -7,6 +7,7 @@ import ctypes
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ import torch
 
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
+from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import load_latest
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, resolve_depths, saved_grid
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import to_pictures
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
@@ -37,7 +39,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
     views, device = read_train_views(config), choose_device(config.machine.device_type)
     held_out = _read_first_split(config, ("val", "test"))
-    preview = None if held_out is None else to_pictures(held_out)[0]
+    preview = None if held_out is None else _first_picture(held_out)
     check_value(
         "patience", config.patience, config.patience is None or preview is not None, "left out: no view is held out"
     )
@@ -59,7 +61,7 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     """The config with nothing left open, its size decided by the training views; a resolved one stays as it is,
     whatever the views. InputError if a value is out of its range."""
     config.check_plan()
-    data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
+    data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.longest_side)
     model, _ = resolve_depths(views, model)
     config = replace(config, pipeline=replace(config.pipeline, model=model))
     preset, by_steps = config.preset, config.time_budget is None and config.segments is None
@@ -137,19 +139,31 @@ def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views |
     return next((views for views in found if views is not None), None)
 
 
+def _first_picture(views: Views) -> Picture:
+    """The first view of which some pixels are known, without converting the others."""
+    return next(picture for i in range(len(views.names)) for picture in to_pictures(views.subset([i])))
+
+
 def read_train_views(config: TrainerConfig) -> Views:
     """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
     if config.data is None:
         raise InputError("--data is missing: the folder to train on (edge-se scenes makes some)")
-    views = _read_split(config, "train")
+    views = _read_split(config, "train", partial(_training_memory, config))
     assert views is not None
     selected = select_views(config, len(views.names))
     return views if selected is None else views.subset(selected)
 
 
-def _read_split(config: TrainerConfig, split: Split) -> Views | None:
+def _training_memory(config: TrainerConfig, longest: int) -> int:
+    """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's."""
+    if choose_device(config.machine.device_type) != "cpu":
+        return 0
+    return decide_size(config.pipeline.model, longest).training_memory
+
+
+def _read_split(config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda longest: 0) -> Views | None:
     assert config.data is not None
-    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale)
+    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory)
     with Progress(0, "reading images") as progress:
         return read_split(config.data, split, settings, progress.update)
 
@@ -180,6 +194,7 @@ def describe_run(trainer: Trainer) -> str:
     lines = [
         f"run      {trainer.run.path}",
         f"data     {trainer.pipeline.data_summary}",
+        *[f"memory   {trainer.pipeline.memory_summary}"] * bool(trainer.pipeline.memory_summary),
         f"depths   {model.near:g} to {model.far:g}",
         f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
         f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",

@@ -7,16 +7,12 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.data.cameras import RayBundle
-from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.config import POINTS_PER_CHUNK, NeRFModelConfig
 from edge_se_sampler.models.field import NeRFField
 from edge_se_sampler.models.hard_samples import evaluate_hard_samples
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.models.rendering import composite, importance, intervals, sample_weights, stratified
 from edge_se_sampler.occupancy.bricks import BrickGrid
-
-POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
-"""Points evaluated at once, by device: bounds the memory. Each chunk draws its own jitter, so another value gives
-another (equally good) training run."""
 
 
 class NeRFModel(RayModel):
