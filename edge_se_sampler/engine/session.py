@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from edge_se_sampler import ranks
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.views import Views
@@ -33,7 +34,9 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
-    views, device = read_train_views(config), choose_device(config.machine.device_type)
+    device = choose_device(config.machine.device_type)
+    ranks.join(device)
+    views = read_train_views(config)
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else to_pictures(held_out)[0]
     began = time.monotonic()
@@ -45,7 +48,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
         disable_malloc_trimming()
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
-    run = run or RunFolder.create(config)
+    run = run or ranks.share(RunFolder.create(config) if ranks.is_main() else None)
     setup_seconds += time.monotonic() - began
     return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
 
