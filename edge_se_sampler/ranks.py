@@ -1,4 +1,4 @@
-"""Processes that train one model together, as torchrun starts them: torch.distributed, by gloo on CPUs and nccl on GPUs.
+"""Processes that train one model together, as torchrun starts them, by torch.distributed: gloo on CPUs, nccl on GPUs.
 
 rank   number of a process, 0 .. world_size - 1; rank 0 alone writes files and prints
 
@@ -8,9 +8,9 @@ Every function is called by all ranks at the same point. In a single process non
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from edge_se_sampler.errors import InputError
 
@@ -73,13 +73,18 @@ def agree(*numbers: float) -> list[float]:
     return find_largest(torch.tensor(numbers, dtype=torch.float64)).tolist()
 
 
-def share(value: Value) -> Value:
-    """What rank 0 passes."""
+def wait() -> None:
+    """Wait until all ranks are here."""
+    agree(0.0)
+
+
+def share(create: Callable[[], Value]) -> Value:
+    """What a function returns on rank 0, which alone calls it."""
     if _world_size == 1:
-        return value
+        return create()
     import torch
 
-    box = [value]
+    box: list[Any] = [create() if is_main() else None]
     with _lost_ranks_as_connection_errors():
         torch.distributed.broadcast_object_list(box, device=torch.device("cpu"))
     return box[0]
@@ -129,6 +134,5 @@ def _lost_ranks_as_connection_errors() -> Iterator[None]:
     try:
         yield
     except RuntimeError as problem:
-        raise ConnectionError(
-            "another process of this training has ended; its last save goes on: edge-se resume RUN"
-        ) from problem
+        message = "another process of this training has ended; continue from what it saved: edge-se resume RUN"
+        raise ConnectionError(message) from problem

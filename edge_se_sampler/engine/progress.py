@@ -22,10 +22,9 @@ class Progress(AbstractContextManager):
 
     def __init__(self, total: int, label: str, start: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         self.total, self.label, self.start, self._clock = total, label, start, clock
-        # disabled where stderr is no terminal
-        self._bar = tqdm(
-            total=total, desc=label, initial=start, leave=False, dynamic_ncols=True, disable=None if is_main() else True
-        )
+        # None: disabled where stderr is no terminal
+        disable = None if is_main() else True
+        self._bar = tqdm(total=total, desc=label, initial=start, leave=False, dynamic_ncols=True, disable=disable)
         self._began = self._last_line = self._last_update = clock()
 
     def update(self, done: int, total: int | None = None, note: str = "") -> None:

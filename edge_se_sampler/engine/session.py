@@ -48,7 +48,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
         disable_malloc_trimming()
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
-    run = run or ranks.share(RunFolder.create(config) if ranks.is_main() else None)
+    run = run or ranks.share(lambda: RunFolder.create(config))
     setup_seconds += time.monotonic() - began
     return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
 

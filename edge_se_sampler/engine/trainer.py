@@ -111,7 +111,7 @@ class Trainer:
                 if ended or self._preview_is_due():
                     with self.turns:
                         self._preview(step)
-                    ranks.agree()  # which waits for the rank that renders
+                    ranks.wait()
                     began = time.monotonic() - self.elapsed  # a preview is not training time
                 if ended or stopping or self.next_step % config.steps_per_save == 0:
                     self.save()
