@@ -25,6 +25,7 @@ LAYERS = [
     ("nerfstudio", "bench", "export", "viewer", "masks"),
     ("commands", "run_commands"),
     ("cli",),
+    ("__main__",),
 ]
 """Files and folders of the package. Each may import from its own layer and from earlier ones."""
 HEAVY = {"torch", "numba", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio", "viser"}
