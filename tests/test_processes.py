@@ -15,6 +15,12 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, override
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.session import prepare
+from edge_se_sampler.methods import method_configs
+from edge_se_sampler.ranks import is_main
+
+STEPS = 50
 
 NETWORK = {"width": 8, "depth": 3, "position_frequencies": 2, "num_coarse_samples": 8, "num_importance_samples": 8}
 DENSE = {
@@ -35,20 +41,15 @@ TRAININGS = {
 }
 
 
-def session(training: str, data: str, output_dir: str, steps: str) -> None:
-    """A process of a training: rank 0 prints the loss of each step."""
-    from edge_se_sampler.engine.session import prepare
-    from edge_se_sampler.methods import method_configs
-    from edge_se_sampler.ranks import is_main
-
+def losses_of(training: str, data: Path, output_dir: Path) -> list[float]:
+    """Of each step, on whatever processes there are; a last checkpoint is saved."""
     method, changes = TRAININGS[training]
-    paths = {"data": Path(data), "output_dir": Path(output_dir), "machine.device_type": "cpu"}
-    trainer = prepare(override(method_configs()[method], changes | paths | {"max_num_iterations": int(steps)}))
-    losses = [trainer.train_iteration(step) for step in range(int(steps))]
-    trainer.next_step = int(steps)
+    paths = {"data": data, "output_dir": output_dir, "machine.device_type": "cpu", "max_num_iterations": STEPS}
+    trainer = prepare(override(method_configs()[method], changes | paths))
+    losses = [trainer.train_iteration(step) for step in range(STEPS)]
+    trainer.next_step = STEPS
     trainer.save()
-    if is_main():
-        print(json.dumps({"losses": losses, "run": str(trainer.run.path), "strategy": trainer.pipeline.datamanager.train_pixel_sampler.strategy, "level": int(getattr(trainer.pipeline.model.grid, "level", 0))}))
+    return losses
 
 
 def start(world: int, *arguments: object) -> list[subprocess.Popen[str]]:
@@ -57,32 +58,78 @@ def start(world: int, *arguments: object) -> list[subprocess.Popen[str]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(world), "OMP_NUM_THREADS": "1"}
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, *map(str, arguments)]
     return [
-        subprocess.Popen(
-            [sys.executable, *map(str, arguments)],
-            env=os.environ | shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        subprocess.Popen(command, env=os.environ | shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)}, **pipes)
         for rank in range(world)
     ]
 
 
-def train(world: int, *arguments: object) -> dict[str, Any]:
-    processes = start(world, __file__, *arguments)
+def finish(processes: list[subprocess.Popen[str]]) -> str:
+    """What rank 0 prints; the others print nothing."""
     (out, err), *others = [process.communicate(timeout=240) for process in processes]
-    assert [process.returncode for process in processes] == [0] * world, (err, others)
-    assert all(out == "" for out, _ in others)
-    return json.loads(out)
+    assert [process.returncode for process in processes] == [0] * len(processes), (err, others)
+    assert not any(text for text, _ in others)
+    return out
 
 
-@pytest.mark.parametrize("training", TRAININGS)
-def test_two_processes_have_the_loss_curve_of_one(training: str, scene: Path, tmp_path: Path) -> None:
-    one, two = (train(world, training, scene, tmp_path / str(world), 50) for world in (1, 2))
-    print(training, one["strategy"], one["level"], max(abs(a / b - 1) for a, b in zip(one["losses"], two["losses"])))
-    assert two["losses"] == pytest.approx(one["losses"], rel=1e-5)
+def check_same_losses(trainings: list[str], scene: Path, output_dir: Path) -> None:
+    two = json.loads(finish(start(2, __file__, scene, output_dir / "two", *trainings)))
+    for training in trainings:
+        one = losses_of(training, scene, output_dir / "one")
+        assert two[training] == pytest.approx(one, rel=1e-5), training
+    assert len(list(output_dir.glob("two/*/*/*/checkpoints/*.ckpt"))) == len(trainings)
+
+
+def test_two_processes_have_the_loss_curve_of_one(scene: Path, tmp_path: Path) -> None:
+    check_same_losses(["dense", "lean, without alpha"], scene, tmp_path)
+
+
+@pytest.mark.slow
+def test_two_processes_have_it_whatever_samplers_learn_from(scene: Path, tmp_path: Path) -> None:
+    check_same_losses(list(TRAININGS), scene, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
+def test_a_killed_process_ends_the_other_and_the_run_goes_on_with_three(
+    killed: int, scene: Path, tmp_path: Path
+) -> None:
+    flags = ["--data", scene, "--output-dir", tmp_path / "runs", "--machine.device-type", "cpu", "--steps-per-save", 5]
+    processes = start(2, "-m", "edge_se_sampler", "train", "lean-nerf", *flags)
+    deadline = time.monotonic() + 120
+    while not (saved := list(tmp_path.glob("runs/*/*/*/checkpoints/*.ckpt"))) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    processes[killed].kill()
+    _, err = processes[1 - killed].communicate(timeout=30)
+    assert processes[1 - killed].returncode == 1
+    assert err.count("\n") == 1, err
+    assert "another process of this training has ended" in err
+    run = RunFolder(saved[0].parent.parent)
+    before = run.metrics()[-1]["step"]
+    out = finish(start(3, "-m", "edge_se_sampler", "resume", run.path, "--max-seconds", 3))
+    assert f"edge-se resume {run.path}" in out
+    assert run.metrics()[-1]["step"] > before
+
+
+@pytest.mark.slow
+def test_a_signal_to_any_process_and_the_clock_of_the_slowest_hold_for_all(scene: Path, tmp_path: Path) -> None:
+    flags = ["--data", scene, "--output-dir", tmp_path / "runs", "--machine.device-type", "cpu", "--time-budget", "1h"]
+    processes = start(2, "-m", "edge_se_sampler", "train", "lean-nerf", *flags)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("runs/*/*/*/metrics.jsonl")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    processes[1].send_signal(signal.SIGTERM)
+    (out, _), _ = (process.communicate(timeout=60) for process in processes)
+    assert [process.returncode for process in processes] == [0, 130]
+    assert "edge-se resume" in out
+    (run,) = tmp_path.glob("runs/*/*/*")
+    assert len(list(run.glob("checkpoints/*.ckpt"))) == 1
 
 
 if __name__ == "__main__":
-    session(*sys.argv[1:])
+    data, folder, *names = sys.argv[1:]
+    found = {name: losses_of(name, Path(data), Path(folder)) for name in names}
+    if is_main():
+        print(json.dumps(found))
