@@ -12,6 +12,7 @@ import tyro
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.ranks import is_main
 from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Training:
         from edge_se_sampler.engine.session import prepare
 
         trainer = prepare(self.config)
-        if not self.view:
+        if not (self.view and is_main()):
             train(trainer)
             return
         from edge_se_sampler.viewer.server import view_training
@@ -156,8 +157,11 @@ def train(trainer: Any) -> None:
     """Train, and say where the result is. Exits with 130 if it was stopped by Ctrl-C."""
     from edge_se_sampler.engine.session import describe_run
 
-    print(describe_run(trainer), flush=True)
+    if is_main():
+        print(describe_run(trainer), flush=True)
     trainer.train()
+    if not is_main():
+        sys.exit(130 if trainer.stop_requested else 0)
     resume = f"edge-se resume {trainer.run.path}"
     if trainer.stop_requested:
         print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)

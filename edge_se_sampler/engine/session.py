@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from edge_se_sampler import ranks
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.memory import ModelMemory
@@ -37,7 +38,9 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
-    views, device = read_train_views(config), choose_device(config.machine.device_type)
+    device = choose_device(config.machine.device_type)
+    ranks.join(device)
+    views = read_train_views(config)
     held_out = _read_first_split(config, ("val", "test"))
     preview = None if held_out is None else _first_picture(held_out)
     check_value(
@@ -52,7 +55,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
         disable_malloc_trimming()
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
-    run = run or RunFolder.create(config)
+    run = run or ranks.share(lambda: RunFolder.create(config))
     setup_seconds += time.monotonic() - began
     return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
 

@@ -15,6 +15,7 @@ import torch
 from torch.optim.lr_scheduler import LambdaLR
 from tqdm import tqdm
 
+from edge_se_sampler import ranks
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.early_stopping import EarlyStopping
@@ -94,7 +95,8 @@ class Trainer:
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
         for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
             group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another
-        self.run.drop_metrics_after(state["step"])
+        if ranks.is_main():
+            self.run.drop_metrics_after(state["step"])
 
     def train(self) -> None:
         """Train until the planned iterations are done, max_seconds have passed, patience is lost, or Ctrl-C; then save.
@@ -103,6 +105,7 @@ class Trainer:
         began = time.monotonic() - self.elapsed
         deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds
         plan = self.plan
+        (self.setup_seconds,) = ranks.agree(self.setup_seconds)
         plan.decide(self.next_step, self.setup_seconds + self.elapsed)
         with self._interruptible(), Progress(plan.num_steps or 0, config.method_name, self.next_step) as progress:
             while self.next_step != plan.num_steps:
@@ -110,25 +113,26 @@ class Trainer:
                 learning_rate = float(self.optimizer.param_groups[0]["lr"])
                 with self.turns:
                     loss = self.train_iteration(step)
-                self.next_step, self.elapsed = step + 1, time.monotonic() - began
+                self.next_step = step + 1
+                stopping = self.stop_requested or time.monotonic() >= deadline
+                self.elapsed, stopping = ranks.agree(time.monotonic() - began, stopping)
                 plan.decide(self.next_step, self.setup_seconds + self.elapsed)
                 ended = self.next_step == plan.num_steps
-                stop = ended or self.stop_requested or time.monotonic() >= deadline
                 if ended or step % config.steps_per_log == 0:
                     strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
                     self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
                 if ended or self._preview_is_due():
                     with self.turns:
                         self._preview(step)
+                    stopping = ranks.share(lambda: self.early_stopping.is_due) or stopping
                     began = time.monotonic() - self.elapsed  # a preview is not training time
-                    stop = stop or self.early_stopping.is_due
-                if stop or self.next_step % config.steps_per_save == 0:
+                if ended or stopping or self.next_step % config.steps_per_save == 0:
                     self.save()
                 total = plan.num_steps or round(self.next_step / max(plan.progress(self.next_step), 1e-3))
                 progress.update(self.next_step, total, note=self._status(loss))
-                if stop:
+                if stopping:
                     break
-        if plan.time_budget is not None and self.next_step == plan.num_steps:
+        if ranks.is_main() and plan.time_budget is not None and self.next_step == plan.num_steps:
             self.config = replace(config, segments=tuple(plan.segments))
             self.run.write_config(self.config)
         self.events.close()
@@ -144,36 +148,39 @@ class Trainer:
         rays, batch = self.pipeline.datamanager.next_train(step)
         self.optimizer.zero_grad()
         batch.pop("full_image", None)  # whole images: not indexed by ray
-        errors = []
+        errors = torch.zeros(len(rays), dtype=model.dtype, device=model.device)
 
         def training_loss(rows: slice) -> torch.Tensor:
             loss, error = model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
-            errors.append(error)
+            errors[rows] = error
             return loss
 
         loss = self._backward(len(rays), training_loss)
         if model.num_unseen_rays:
             unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, stream(seed, step, Stream.UNSEEN))
             loss += self._backward(len(unseen), lambda rows: model.auxiliary_loss(unseen[rows]))
+        ranks.add_up_gradients(model.parameters(), loss)
         value = float(loss)
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
         reinitialized = {} if self.dead_network_reset is None else self.dead_network_reset.after_backward()
         for network, sub_seed in reinitialized.items():
             message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
-            tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
+            if ranks.is_main():
+                tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
             self._record(step, reinitialized=network, sub_seed=sub_seed)
         self.optimizer.step()
         self.scheduler.step()
-        self.pipeline.datamanager.observe(torch.cat(errors))
+        self.pipeline.datamanager.observe(errors)
         for callback in self.callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return value
 
     def _backward(self, num_rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
-        """Accumulate the gradients of the mean loss over rays, chunk by chunk, and return that mean."""
+        """Accumulate the gradients of the mean loss over rays, chunk by chunk, and return that mean; of several ranks,
+        each has its part of both sums."""
         loss = torch.zeros((), device=self.pipeline.model.device)
-        for rows in self.pipeline.model.chunks(num_rays):
+        for rows in self.pipeline.model.own_chunks(num_rays):
             chunk_loss = loss_of(rows).sum() / num_rays
             chunk_loss.backward()
             loss += chunk_loss.detach()
@@ -187,6 +194,8 @@ class Trainer:
         ]  # needs no memory
         if not torch.cat(extremes).isfinite().all():
             raise FloatingPointError(f"a weight is not finite after step {step}; try a lower --optimizer.lr")
+        if not ranks.is_main():
+            return
         state = {
             "step": step,
             "elapsed": self.elapsed,
@@ -203,6 +212,8 @@ class Trainer:
         save_checkpoint(self.run.checkpoints, step, state)
 
     def _record(self, step: int, **values: Any) -> None:
+        if not ranks.is_main():
+            return
         line = {"step": step, **values, "seconds": round(self.elapsed, 3)}
         self.run.log(line)
         self.events.write(line)
@@ -216,7 +227,7 @@ class Trainer:
         return before < now
 
     def _preview(self, step: int) -> None:
-        if self.preview_picture is not None:
+        if self.preview_picture is not None and ranks.is_main():
             rendered, self._preview_psnr = render_view(self.pipeline.model, self.preview_picture)
             self.early_stopping.update(self._preview_psnr)
             self._record(step, val_psnr=self._preview_psnr)

@@ -72,8 +72,7 @@ class NeRFModel(RayModel):
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
         noise = None
         if self.training and self.config.density_noise:
-            draws = torch.randn(t.numel(), generator=self.random, device=self.device, dtype=self.dtype)
-            noise = draws * self.config.density_noise
+            noise = self.draw(torch.randn, *t.shape).reshape(-1) * self.config.density_noise
         if self.grid is None:
             density, color = self._evaluate(field, positions, rays.directions, None, noise)
         else:
