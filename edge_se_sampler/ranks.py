@@ -73,11 +73,6 @@ def agree(*numbers: float) -> list[float]:
     return find_largest(torch.tensor(numbers, dtype=torch.float64)).tolist()
 
 
-def wait() -> None:
-    """Wait until all ranks are here."""
-    agree(0.0)
-
-
 def share(create: Callable[[], Value]) -> Value:
     """What a function returns on rank 0, which alone calls it."""
     if _world_size == 1:

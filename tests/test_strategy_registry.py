@@ -25,7 +25,7 @@ from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 sampler = EdgeSEPixelSampler(EdgeSEPixelSamplerConfig(early="dark", late="uniform"), num_rays_per_batch=1000)
-sampler.bind(squared_error=lambda batch: None, planned_steps=100, seed=0)
+sampler.bind(squared_error=lambda batch: None, progress=lambda step: step / 100, seed=0)
 image = torch.zeros(1, 10, 10, 3, dtype=torch.uint8)
 image[:, 5:] = 255
 rows = sampler.sample({"image": image, "image_idx": torch.tensor([0])})["indices"][:, 1]

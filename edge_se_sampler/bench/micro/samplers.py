@@ -49,7 +49,7 @@ def ten_steps(late: str, images: int, size: int, draws: int) -> Callable[[int], 
     """A function that takes ten steps with a strategy, on copies of one noise image, whose errors are random."""
     config = EdgeSEPixelSamplerConfig(early="uniform", late=late, images_per_step="all")
     sampler, errors = EdgeSEPixelSampler(config, num_rays_per_batch=draws), torch.rand(draws)
-    sampler.bind(squared_error=lambda _: errors, planned_steps=1, seed=0)
+    sampler.bind(squared_error=lambda _: errors, progress=lambda _: 1.0, seed=0)
     noise = torch.randint(256, (1, size, size, 3), dtype=torch.uint8)
     batch = {"image": noise.expand(images, -1, -1, -1), "image_idx": torch.arange(images)}
 
