@@ -64,9 +64,7 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
     lines += [f"of {len(odd)} images all or nothing is object, {odd[0]} for one"] if odd else []
     then = f"edge-se train lean-nerf --data {folder} --masks object"
     if out != folder:
-        then = (
-            f"copy {', '.join(target.name for target in targets)} from {out} into {folder}, or a copy of it, and {then}"
-        )
+        then = f"copy what is in {out} into {folder}, or into a copy of it; then: {then}"
     return "\n".join([*lines, f"look at {picture}; then: {then}"])
 
 

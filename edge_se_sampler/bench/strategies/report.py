@@ -32,6 +32,7 @@ VERDICTS: dict[Verdict | None, str] = {
     None: "no verdict (one seed)",
 }
 """In words; the first that a strategy has anywhere says whether to use it."""
+ANSWERS: dict[Verdict | None, str] = {"better": "yes, ", "worse": "no, ", "same": "no need, ", None: ""}
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
@@ -97,17 +98,16 @@ def describe_use(runs: list[Run], strategy: str) -> str:
     where: dict[Verdict | None, list[str]] = {
         v: [label for label, comparison in found.items() if comparison.verdict == v] for v in VERDICTS
     }
-    judged = [verdict for verdict in VERDICTS if where[verdict]]
+    judged: list[Verdict | None] = [verdict for verdict in VERDICTS if where[verdict]]
     if not judged:
         return "–"
-    answer = {"better": "yes, ", "worse": "no, ", "same": "no need, "}.get(judged[0] or "", "")
-    places = {
-        verdict: f": {' and '.join(where[verdict])}"
+    texts = [
+        f"{VERDICTS[verdict]}: {' and '.join(where[verdict])}"
         if verdict in ("better", "worse")
-        else f" in {len(where[verdict])} of {len(found)}"
+        else f"{VERDICTS[verdict]} in {len(where[verdict])} of {len(found)}"
         for verdict in judged
-    }
-    return answer + "; ".join(VERDICTS[verdict] + place for verdict, place in places.items())
+    ]
+    return ANSWERS[judged[0]] + "; ".join(texts)
 
 
 def _compare_everywhere(runs: list[Run], strategy: str) -> dict[str, Comparison]:
