@@ -102,7 +102,7 @@ def test_changed_metrics(times: int, trained: Path, capfd: pytest.CaptureFixture
 def test_a_changed_result(times: int, tmp_path: Path) -> None:
     path, rng = tmp_path / "result.json", random.Random(0)
     runs = [{"scene": "mic", "seed": seed, "psnr": 30 * rng.random(), "curve": [[2, 1e-7]]} for seed in range(9)]
-    write_result(path, {**new_result("toy", {"steps": 3, 7: "a number as a key"}), "errors": [], "runs": runs})
+    write_result(path, {**new_result("toy", {"steps": 3}), "errors": [], "runs": runs, "seconds": {10: 0.5, 9: 1.5}})
     check_changes(path, lambda: read_result(path), times)
 
 
@@ -128,6 +128,11 @@ def flip_newest(run: Path) -> Path:
 def test_every_command_takes_the_checkpoint_before_a_damaged_one(
     command: str, trained: Path, tmp_path: Path, edge_se, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    flags = {
+        "eval": ["--output-path", tmp_path / "eval.json"],
+        "render": ["--output-path", tmp_path / "turn.gif", "--num-frames", 2],
+        "export": ["points", "--output-path", tmp_path / "points.ply"],
+    }
     newest = flip_newest(trained)
     if command == "view":
         pytest.importorskip("viser", reason="the viewer needs the [view] extra")
@@ -139,11 +144,6 @@ def test_every_command_takes_the_checkpoint_before_a_damaged_one(
         assert viewed.trainer.next_step == 3
         said = capfd.readouterr().err
     else:
-        flags = {
-            "eval": ["--output-path", tmp_path / "eval.json"],
-            "render": ["--output-path", tmp_path / "turn.gif", "--num-frames", 2],
-            "export": ["points", "--output-path", tmp_path / "points.ply"],
-        }
         answer = edge_se(command, trained, *flags.get(command, []))
         assert answer.code == 0, answer.err
         said = answer.err

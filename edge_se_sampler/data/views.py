@@ -51,7 +51,7 @@ class Views:
         digest = hashlib.sha256()
         for array in (*self.images, *(self.masks or ())):
             digest.update(f"{array.shape}".encode())
-            digest.update(np.ascontiguousarray(array))
+            digest.update(np.ascontiguousarray(array).data)
         for values in vars(self.cameras).values():
             digest.update(values.float().numpy().tobytes())
         return digest.hexdigest()

@@ -97,14 +97,15 @@ class RunFolder:
         if not path.exists():
             return []
         try:
-            unchecked = json.loads((self.path / "config.json").read_bytes()).get("format", 2) == 2
+            has_checksums = json.loads((self.path / "config.json").read_bytes()).get("format", 2) > 2
             *complete, rest = path.read_text(encoding="utf-8").split("\n")
             lines = [json.loads(line) for line in complete]
             for line in lines:
                 claimed = line.pop("crc32", None)
-                if not isinstance(line["step"], int) or claimed not in ((None,) * unchecked + (_crc32(line),)):
+                is_checked = claimed == _crc32(line) or (claimed is None and not has_checksums)
+                if not isinstance(line["step"], int) or not is_checked:
                     raise ValueError(f"the line of step {line['step']} is not as it was written")
-        except (OSError, ValueError, KeyError, TypeError) as problem:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
             raise InputError(f"{path}: damaged ({problem!r}); mend or remove it") from problem
         if rest:
             print(f"edge-se: {path}: its last line was cut short and is left out", file=sys.stderr)
