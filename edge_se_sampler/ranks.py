@@ -134,5 +134,5 @@ def _lost_ranks_as_connection_errors() -> Iterator[None]:
     try:
         yield
     except RuntimeError as problem:
-        message = "another process of this training has ended; continue from what it saved: edge-se resume RUN"
+        message = "another process of this training has ended, or does not answer; continue: edge-se resume RUN"
         raise ConnectionError(message) from problem
