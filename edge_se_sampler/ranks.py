@@ -97,14 +97,14 @@ def add_up_gradients(weights: Iterable[Tensor], loss: Tensor) -> None:
         return
     import torch
 
-    weights = [weight for weight in weights if weight.grad is not None]
-    dense = [loss, *(weight.grad for weight in weights if not weight.grad.is_sparse)]
+    gradients = [(weight, weight.grad) for weight in weights if weight.grad is not None]
+    dense = [loss, *(gradient for _, gradient in gradients if not gradient.is_sparse)]
     sums = add_up(torch.cat([values.flatten() for values in dense])).split([values.numel() for values in dense])
     for values, summed in zip(dense, sums, strict=True):
         values.copy_(summed.view_as(values))
-    for weight in weights:
-        if weight.grad.is_sparse:
-            weight.grad = _add_up_rows(weight.grad)
+    for weight, gradient in gradients:
+        if gradient.is_sparse:
+            weight.grad = _add_up_rows(gradient)
 
 
 def _add_up_rows(gradient: Tensor) -> Tensor:
