@@ -92,14 +92,14 @@ def add_up_gradients(weights: Iterable[Tensor], loss: Tensor) -> None:
         return
     import torch
 
-    weights = [weight for weight in weights if weight.grad is not None]
-    dense = [loss, *(weight.grad for weight in weights if not weight.grad.is_sparse)]
+    gradients = [(weight, weight.grad) for weight in weights if weight.grad is not None]
+    dense = [loss, *(gradient for _, gradient in gradients if not gradient.is_sparse)]
     sums = add_up(torch.cat([values.flatten() for values in dense])).split([values.numel() for values in dense])
     for values, summed in zip(dense, sums, strict=True):
         values.copy_(summed.view_as(values))
-    for weight in weights:
-        if weight.grad.is_sparse:
-            weight.grad = _add_up_rows(weight.grad)
+    for weight, gradient in gradients:
+        if gradient.is_sparse:
+            weight.grad = _add_up_rows(gradient)
 
 
 def _add_up_rows(gradient: Tensor) -> Tensor:
@@ -129,5 +129,5 @@ def _lost_ranks_as_connection_errors() -> Iterator[None]:
     try:
         yield
     except RuntimeError as problem:
-        message = "another process of this training has ended; continue from what it saved: edge-se resume RUN"
+        message = "another process of this training has ended, or does not answer; continue: edge-se resume RUN"
         raise ConnectionError(message) from problem

@@ -25,7 +25,7 @@ STEPS = 50
 
 NETWORK = {"width": 8, "depth": 3, "position_frequencies": 2, "num_coarse_samples": 8, "num_importance_samples": 8}
 DENSE = {
-    f"{MANAGER}.train_num_rays_per_batch": 683,  # one more than a chunk has: one of two processes has no ray of it
+    f"{MANAGER}.train_num_rays_per_batch": 65,
     **{f"{MODEL}.{name}": value for name, value in (NETWORK | {"density_noise": 0.1}).items()},
     f"{MODEL}.background_color": "random",
     f"{SAMPLER}.early_fraction": 0.3,
@@ -33,6 +33,8 @@ DENSE = {
 LEAN = {f"{MANAGER}.train_num_rays_per_batch": 250, f"{SAMPLER}.early_fraction": 0.3}
 TRAININGS = {
     "dense": ("edge-se-nerf", DENSE),
+    # one more than a chunk has: one of two processes has no ray of the second
+    "dense, in chunks": ("edge-se-nerf", DENSE | {f"{MANAGER}.train_num_rays_per_batch": 683}),
     "dense, cached errors": ("edge-se-nerf", DENSE | {f"{SAMPLER}.error_source": "cached"}),
     "dense, adaptive schedule": ("edge-se-nerf", DENSE | {f"{SAMPLER}.schedule": "adaptive", "reinit_dead": True}),
     "unseen rays": ("edge-se-info-nerf", DENSE | {f"{MODEL}.num_unseen_rays": 7}),
