@@ -466,6 +466,7 @@ def test_runs_of_before_a_setting_was_added_are_read_and_resumed() -> None:
     assert config_from_json(config, old, "old") == config
     other = override(config, {"pipeline.datamanager.pixel_sampler.soft_mining_alpha": 0.3})
     assert config_from_json(config, config_to_json(other), "new") == other
+    assert config_digest(config).startswith("8d8f64a2b612fb59")  # what 0.1.0 wrote, without the setting
     assert config_digest(other) != config_digest(config)
     del old["pipeline"]["datamanager"]["pixel_sampler"]["early"]
     with pytest.raises(InputError, match=r"fields: \['early'\]"):
