@@ -30,7 +30,7 @@ def random(*size: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(np.random.default_rng(seed).random(size))
 
 
-def field_and_points(activation: Any, packed: bool) -> tuple[NeRFField, tuple[Any, ...]]:
+def field_and_points(activation: Any, packed: bool) -> tuple[NeRFField, tuple[Any, Any, Any, Any]]:
     field = NeRFField(tiny_config(density_activation=activation), np.random.default_rng(1)).double()
     indices = torch.arange(RAYS).repeat_interleave(SAMPLES)
     if packed:
@@ -189,7 +189,7 @@ def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     whole.next_step = 4
     whole.save()
     resumed = resume_trainer(whole, views)
-    assert resumed.config.pipeline.model.hard_samples
+    assert vars(resumed.config.pipeline.model)["hard_samples"]
     for step in range(4, 8):
         assert whole.train_iteration(step) == resumed.train_iteration(step)
     for weight, again in zip(whole.pipeline.model.parameters(), resumed.pipeline.model.parameters(), strict=True):

@@ -95,8 +95,8 @@ class Distribution(SamplerPart):
     from `tables` of its own."""
 
     name: ClassVar[str]
-    new_table: ClassVar[Callable[[], Any]] = PixelTable
-    """Makes what pixels are drawn from, with the methods of `PixelTable`."""
+    new_table: ClassVar[type[PixelTable | RegionTable]] = PixelTable
+    """What its pixels are drawn from."""
 
     def __init__(self, settings: SamplingSettings) -> None:
         self.settings = settings
