@@ -38,7 +38,8 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def settings(**values: Any) -> EdgeSEPixelSamplerConfig:
-    return EdgeSEPixelSamplerConfig(**{"early": "uniform", "images_per_step": "all"} | values)
+    values = {"early": "uniform", "images_per_step": "all"} | values
+    return EdgeSEPixelSamplerConfig(**values)
 
 
 def errors_of(pixels: dict[str, Any]) -> torch.Tensor:
@@ -51,7 +52,8 @@ def trained(
     name: str, steps: int, batch: dict[str, Any], sampler: EdgeSEPixelSampler | None = None, **more: Any
 ) -> Any:
     """A sampler after so many late steps, and the indices and weights of the last one."""
-    sampler = sampler or following(LATE, early="uniform", late=name, **{"images_per_step": "all"} | more)
+    more = {"early": "uniform", "late": name, "images_per_step": "all"} | more
+    sampler = sampler or following(LATE, **more)
     pixels: dict[str, Any] = {}
     for _ in range(steps):
         pixels = sampler.sample(batch)

@@ -13,6 +13,7 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import STRATEGIES
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, Selector, TrainingStep
 from edge_se_sampler.sampling.registry import BOTH, PIXEL_STRATEGIES, PixelStrategy, strategy_names
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 def in_box(indices: torch.Tensor) -> bool:
@@ -124,16 +125,22 @@ def test_a_custom_selector(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_strategy_or_one_of_the_other_phase_is_refused_in_a_line(phase: Any, name: str) -> None:
     known = (*strategy_names(phase), *(["auto"] if phase == "early" else []))
     with pytest.raises(InputError) as refusal:
-        following(**{phase: name})
+        EdgeSEPixelSamplerConfig(**{phase: name}).setup()  # pyright: ignore[reportArgumentType]
     assert str(refusal.value) == f"--pixel-sampler.{phase}: {name!r} is none of {', '.join(known)}"
+
+
+class NoPart:
+    """What another package may take for a strategy."""
+
+    def __init__(self, settings: Any) -> None: ...
 
 
 def test_what_is_no_strategy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PIXEL_STRATEGIES, "typo", PixelStrategy("edge_se_sampler:EdgePixels", BOTH, ""))
     with pytest.raises(InputError, match=r"edge_se_sampler:EdgePixels cannot be imported: .* no attribute"):
         following(late="typo")
-    monkeypatch.setitem(PIXEL_STRATEGIES, "number", PixelStrategy(lambda settings: 1, BOTH, ""))
-    with pytest.raises(InputError, match="'number': int is no Distribution and no Selector"):
+    monkeypatch.setitem(PIXEL_STRATEGIES, "number", PixelStrategy(NoPart, BOTH, ""))
+    with pytest.raises(InputError, match="'number': NoPart is no Distribution and no Selector"):
         following(late="number")
 
 
@@ -143,9 +150,10 @@ def test_what_a_strategy_refuses_and_settings_of_its_own(monkeypatch: pytest.Mon
     monkeypatch.setitem(PIXEL_STRATEGIES, "by-column", strategy)
     following(early="by-column", images_per_step="all", edge_epsilon=0.02)
     following(images_per_step="one")
-    for settings, problem in (
+    refused: list[tuple[dict[str, Any], str]] = [
         ({"late": "by-column"}, "images-per-step is 'one': compares images"),
         ({"edge_epsilon": 0.02}, "edge-epsilon is 0.02: has no effect without early or late by-column"),
-    ):
+    ]
+    for settings, problem in refused:
         with pytest.raises(InputError, match=problem):
             following(**settings)

@@ -175,8 +175,12 @@ class TrainerConfig(InstantiateConfig):
         if given and self.max_num_iterations is not None:
             raise InputError("--max-num-iterations and --time-budget or --segments: give one of them")
         sampler = self.pipeline.datamanager.pixel_sampler
-        in_fraction = isinstance(sampler, SamplingSettings) and sampler.schedule == "fraction"
-        if given and in_fraction and sampler.early not in ("uniform", "auto", sampler.late):
+        has_fraction = (
+            isinstance(sampler, SamplingSettings)
+            and sampler.schedule == "fraction"
+            and sampler.early not in ("uniform", "auto", sampler.late)
+        )
+        if given and has_fraction:
             raise InputError(f"--{SAMPLER.replace('_', '-')}.schedule fraction needs a number of iterations; use steps")
         valid = self.segments is None or (len(self.segments) == 100 and min(self.segments) >= 0 < sum(self.segments))
         check_value("segments", self.segments, valid, "100 numbers of iterations, not all of them 0")

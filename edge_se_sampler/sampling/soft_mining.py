@@ -65,7 +65,8 @@ class SoftMining(LearnedDistribution):
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
         """Move the walkers, and return the pixels that they stand on."""
-        cells, table_index, drawable = self.drawable(batch)
+        _, table_index, drawable = self.drawable(batch)
+        cells = self.cells
         self._walking = -1
         if self.settings.images_per_step == "one":
             choice = stream(step.seed, step.number, Stream.PIXELS).integers(len(drawable), size=1)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels
+from edge_se_sampler.sampling.distribution import UniformPixels
 from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.error_map import ErrorMap
 from edge_se_sampler.sampling.image_batch import ImageBatch
-from edge_se_sampler.sampling.parts import Distribution, PixelBatch, Selector, TrainingStep
+from edge_se_sampler.sampling.parts import Distribution, PixelBatch, PixelSource, Selector, TrainingStep
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.ranking import sample_by_rank
 from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
@@ -36,7 +36,7 @@ class Uniform(Distribution):
         inside[top : top + height, left : left + width] = 1
         return inside
 
-    def tables(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor]:
+    def tables(self, batch: ImageBatch) -> tuple[PixelSource, Tensor]:
         """Without masks no table is needed."""
         if batch.mask is not None:
             return super().tables(batch)
