@@ -13,6 +13,7 @@ import torch
 from tiny import SMALL, grid_of, resume_trainer, tiny_config, tiny_model, tiny_rays, tiny_trainer, tiny_views
 from torch import Tensor
 
+from edge_se_sampler.engine.run_folder import config_digest, config_from_json, config_to_json
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import hard_samples
 from edge_se_sampler.models.config import InfoNeRFModelConfig
@@ -29,7 +30,7 @@ def random(*size: int, seed: int = 0) -> Tensor:
     return torch.from_numpy(np.random.default_rng(seed).random(size))
 
 
-def field_and_points(activation: Any, packed: bool) -> tuple[NeRFField, tuple[Any, ...]]:
+def field_and_points(activation: Any, packed: bool) -> tuple[NeRFField, tuple[Any, Any, Any, Any]]:
     field = NeRFField(tiny_config(density_activation=activation), np.random.default_rng(1)).double()
     indices = torch.arange(RAYS).repeat_interleave(SAMPLES)
     if packed:
@@ -188,11 +189,26 @@ def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     whole.next_step = 4
     whole.save()
     resumed = resume_trainer(whole, views)
-    assert resumed.config.pipeline.model.hard_samples
+    assert vars(resumed.config.pipeline.model)["hard_samples"]
     for step in range(4, 8):
         assert whole.train_iteration(step) == resumed.train_iteration(step)
     for weight, again in zip(whole.pipeline.model.parameters(), resumed.pipeline.model.parameters(), strict=True):
         assert torch.equal(weight, again)
+
+
+def test_runs_from_before_the_setting_are_loaded_and_resumed() -> None:
+    config = method_configs()["info-nerf"]
+    values = config_to_json(config)
+    del values["pipeline"]["model"]["hard_samples"]
+    del values["pipeline"]["datamanager"]["pixel_sampler"]["quadtree_threshold"]
+    assert config_from_json(config, values, "here") == config
+    earlier, chosen = (
+        replace(config, pipeline=replace(config.pipeline, model=replace(config.pipeline.model, hard_samples=hard)))
+        for hard in (False, True)
+    )
+    assert config_digest(earlier) == config_digest(config)
+    assert config_digest(chosen) != config_digest(config)
+    assert config_from_json(config, config_to_json(chosen), "here") == chosen
 
 
 def test_lean_nerf_has_no_such_flag(edge_se: Any, scene: Path, tmp_path: Path) -> None:

@@ -50,6 +50,11 @@ def error_at(pixels: dict[str, Any]) -> Tensor:
     return 0.0005 + column / 50 * (pixels["image"].double().std(dim=1) > 5)
 
 
+def part_of(sampler: Any, strategy: str) -> Any:
+    """The distribution of a strategy."""
+    return sampler.strategies[strategy].distribution
+
+
 def trained(strategy: str, host: dict[str, Any], steps: int = 40, **settings: Any) -> EdgeSEPixelSampler:
     """A sampler that has learnt for some steps of a late phase."""
     sampler = following(rays=64, planned=10, late=strategy, early="uniform", early_fraction=0.0, **settings)
@@ -62,7 +67,7 @@ def trained(strategy: str, host: dict[str, Any], steps: int = 40, **settings: An
 def reference(sampler: EdgeSEPixelSampler, host: dict[str, Any], k: int) -> np.ndarray:
     """(H, W) p of an image's pixels, by the rules and what the sampler has learnt."""
     name = sampler.config.late
-    image, part = host["image"][k].numpy(), sampler.strategies[name].distribution
+    image, part = host["image"][k].numpy(), part_of(sampler, name)
     valid = host["mask"][k][..., 0].numpy() if "mask" in host else np.ones(image.shape[:2], dtype=bool)
     change = color_change(image)
     if name == "regions":
@@ -203,7 +208,7 @@ def test_open_leaves_with_large_errors_are_subdivided_when_enough_is_known(monke
 def test_an_image_that_is_met_later_begins_with_open_leaves() -> None:
     host = smooth_batch(SAME)
     sampler = trained("quadtree", {key: value[:2] for key, value in host.items()}, steps=80)
-    part = sampler.strategies["quadtree"].distribution
+    part = part_of(sampler, "quadtree")
     assert part.forest.deepest > START_LEVEL
     before = part.forest.level.copy()
     sampler.sample(host)
@@ -217,7 +222,7 @@ def test_an_image_that_is_met_later_begins_with_open_leaves() -> None:
 def test_a_regions_error_is_a_running_mean() -> None:
     host = smooth_batch(MIXED)
     sampler = following(rays=5000, planned=10, late="regions", early_fraction=0.0, images_per_step="all")
-    part = sampler.strategies["regions"].distribution
+    part = part_of(sampler, "regions")
     assert part.region_strength.tolist() == [1, 1, 1]
     mean, seen = [0.0] * 3, [0.0] * 3
     for step in range(8):
@@ -239,7 +244,7 @@ def test_a_regions_error_is_a_running_mean() -> None:
 
 
 def test_no_region_is_forgotten() -> None:
-    part = following(late="regions").strategies["regions"].distribution
+    part = part_of(following(late="regions"), "regions")
     part.load_state_dict({"errors": [0.0, 2.0, 0.0], "seen": [5.0, 5.0, 0.0]})
     assert part.region_strength.tolist() == [FLOOR, 1, 1]
     part.load_state_dict({"errors": [0.0, 0.0, 0.0], "seen": [5.0, 5.0, 0.0]})
@@ -250,7 +255,7 @@ def test_no_region_is_forgotten() -> None:
 def test_errors_of_pixels_drawn_otherwise_are_not_learnt_from(strategy: str) -> None:
     host = smooth_batch(SAME)
     sampler = following(0, late=strategy, early="edge")
-    part = sampler.strategies[strategy].distribution
+    part = part_of(sampler, strategy)
     pixels = sampler.sample(host)
     before = part.state_dict()
     sampler.observe(error_at(pixels))
@@ -291,7 +296,7 @@ def test_pixels_are_drawn_as_the_rule_says(strategy: str, masked: bool) -> None:
 def test_density_ratios_are_those_of_the_draws(strategy: str, masked: bool) -> None:
     host = smooth_batch(MIXED, masked)
     sampler = trained(strategy, host)
-    part, batch = sampler.strategies[strategy].distribution, ImageBatch.of(host, use_mask=True)
+    part, batch = part_of(sampler, strategy), ImageBatch.of(host, use_mask=True)
     for k, (height, width) in enumerate(MIXED):
         p = reference(sampler, host, k)
         every = torch.cartesian_prod(torch.tensor([k]), torch.arange(height), torch.arange(width))
@@ -320,7 +325,7 @@ def test_expanded_errors_are_those_of_the_whole_image() -> None:
     sampler = trained("expansive", host, images_per_step="all")
     sampler.set_num_rays_per_batch(20_000)
     pixels = sampler.sample(host)
-    every = [
+    every: list[Any] = [
         (i, *at, image[at])
         for i, image in zip(NUMBERS, host["image"], strict=True)
         for at in np.ndindex(*image.shape[:2])
@@ -412,7 +417,7 @@ def test_a_resumed_run_is_the_same_bit_for_bit(strategy: str, tmp_path: Path) ->
     for step in range(16, 45):
         assert whole.train_iteration(step) == resumed.train_iteration(step)
     if strategy == "quadtree":
-        forest = whole.pipeline.datamanager.train_pixel_sampler.strategies[strategy].distribution.forest
+        forest = part_of(whole.pipeline.datamanager.train_pixel_sampler, strategy).forest
         assert forest.deepest > START_LEVEL
 
 
@@ -445,4 +450,4 @@ def test_settings_without_meaning_are_refused(settings: dict[str, Any], problem:
 def test_tables_take_at_most_5_bytes_a_pixel(strategy: str) -> None:
     sampler = following(early=strategy)
     sampler.sample(batch_of([(256, 256)] * 2, [0, 1], channels=3))
-    assert sampler.strategies[strategy].distribution._table.nbytes <= 5 * 2 * 256 * 256
+    assert part_of(sampler, strategy)._table.nbytes <= 5 * 2 * 256 * 256

@@ -15,6 +15,7 @@ expectation is the full gradient. The hardest sample is always kept.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ def keep_probability(hardness: Tensor) -> Tensor:
     return (share * share.sum() / share.square().sum().clamp(min=1)).clamp(max=1)
 
 
-def raw_gradient_norm(field: NeRFField, outputs: tuple[Tensor, Tensor], gradients: tuple[Tensor, Tensor]) -> Tensor:
+def raw_gradient_norm(field: NeRFField, outputs: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
     """g (m,), from densities (m,) and colors (m, 3) and the loss's gradients by them."""
     (density, color), (by_density, by_color) = outputs, gradients
     slope = -torch.expm1(-density) if field.softplus else (density > 0).to(density.dtype)
@@ -47,9 +48,9 @@ class _HardSamples(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor):
+    def backward(ctx: Any, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         positions, directions, ray_indices, noise, uniform, *outputs = ctx.saved_tensors
-        probability = keep_probability(raw_gradient_norm(ctx.field, (outputs[0], outputs[1]), gradients))
+        probability = keep_probability(raw_gradient_norm(ctx.field, outputs, gradients))
         kept = torch.nonzero(uniform < probability)[:, 0]
         if ray_indices is None:
             rays = torch.div(kept, len(positions) // len(directions), rounding_mode="floor")

@@ -95,8 +95,8 @@ class Distribution(SamplerPart):
     from `tables` of its own."""
 
     name: ClassVar[str]
-    new_table: ClassVar[Callable[[], Any]] = PixelTable
-    """Makes what pixels are drawn from, with the methods of `PixelTable`."""
+    new_table: ClassVar[type[PixelTable | RegionTable]] = PixelTable
+    """What its pixels are drawn from."""
 
     def __init__(self, settings: SamplingSettings) -> None:
         self.settings = settings
@@ -121,9 +121,8 @@ class Distribution(SamplerPart):
         # strided: a table's draws come ordered by image
         pixels = source.draw(table_index[drawable], count * step.world, rng)[step.rank :: step.world]
         pixels[:, 0] = drawable[pixels[:, 0]]
-        return PixelBatch(
-            batch, pixels, self, drawn_ratio=self.density_ratio(batch, pixels) if self.needs_errors else None
-        )
+        drawn_ratio = self.density_ratio(batch, pixels) if self.needs_errors else None
+        return PixelBatch(batch, pixels, self, drawn_ratio=drawn_ratio)
 
     def density_ratio(self, batch: ImageBatch, pixels: Tensor) -> Tensor:
         """p/u (n,) of pixels (n, 3): position in the batch, row, column."""

@@ -60,6 +60,7 @@ class Regions(Distribution):
     def tables(self, batch: ImageBatch) -> tuple[RegionTable, Tensor]:
         """As `Distribution.tables`, with the current strengths."""
         table, table_index = super().tables(batch)
+        assert isinstance(table, RegionTable)
         table.strength = self.region_strength
         return table, table_index
 

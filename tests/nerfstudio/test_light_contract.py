@@ -162,7 +162,7 @@ def test_the_same_pixels_are_drawn_as_on_our_own_base(kind: str, strategy: str, 
     assert not torch.equal(*drawn)
 
 
-@pytest.mark.parametrize("name", ["error-map", "error-cdf", "soft-mining", "actray"])
+@pytest.mark.parametrize("name", ["error-map", "error-cdf", "soft-mining", "actray", "regions", "quadtree"])
 @pytest.mark.parametrize("kind", BATCHES)
 def test_strategies_that_learn_from_errors_draw_the_same_pixels_as_on_our_own_base(kind: str, name: str) -> None:
     batch, settings = BATCHES[kind](), {"early": name, "late": name, "images_per_step": "all"}
@@ -184,6 +184,12 @@ def test_strategies_that_learn_from_errors_draw_the_same_pixels_as_on_our_own_ba
 def test_the_hosts_losses_take_no_weights_of_soft_mining() -> None:
     with pytest.raises(InputError, match=r"soft-mining-alpha is 0.6: nerfstudio's losses take no weights"):
         EdgeSEPixelSamplerConfig(late="soft-mining", soft_mining_alpha=0.6).check()
+
+
+@pytest.mark.parametrize("phase", ["early", "late"])
+def test_expansive_supervision_is_refused_where_losses_take_no_weights(phase: str) -> None:
+    with pytest.raises(InputError, match=rf"{phase} is 'expansive': weights the loss, and nerfstudio's losses take no"):
+        EdgeSEPixelSamplerConfig(**{phase: "expansive"}).check()
 
 
 def test_the_strategies_are_not_all_the_same_draw() -> None:
