@@ -83,7 +83,7 @@ class Trainer:
             remedy = "restore them, or add --changed-data True"
             raise InputError(f"{self.config.data}: not the training images that the run began with; {remedy}")
         load_weights(self.pipeline.model, state["model"])
-        if state["optimizer"] is not None:  # format 2 had none in a run that has ended
+        if state["optimizer"] is not None:  # of a run that has ended
             self.optimizer.load_state_dict(state["optimizer"])
         self.plan.load_state_dict(state["plan"])
         self.scheduler.load_state_dict(state["scheduler"])
@@ -189,6 +189,8 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of the steps done so far; FloatingPointError, and no file, if a weight is not finite."""
         step = self.next_step - 1
+        # for good: what has a number of iterations can be given a larger one
+        ended = self.next_step == self.plan.num_steps and self.config.max_num_iterations is None
         extremes = [
             torch.stack(torch.aminmax(weight)) for weight in self.pipeline.model.parameters()
         ]  # needs no memory
@@ -202,7 +204,7 @@ class Trainer:
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
             "plan": self.plan.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": None if ended else self.optimizer.state_dict(),  # as large as the model, twice
             "scheduler": self.scheduler.state_dict(),
             "dead_network_reset": None if self.dead_network_reset is None else self.dead_network_reset.state_dict(),
             "sampler": self.pipeline.datamanager.state_dict(),
