@@ -44,15 +44,20 @@ TRAININGS = {
 }
 
 
-def losses_of(training: str, data: Path, output_dir: Path) -> list[float]:
-    """Of each step, on whatever processes there are; a last checkpoint is saved."""
+def curves_of(training: str, data: Path, output_dir: Path) -> tuple[list[float], list[float]]:
+    """The loss of each step, and what a grid has seen by then, on whatever processes there are; a last checkpoint is
+    saved."""
     method, changes = TRAININGS[training]
     paths = {"data": data, "output_dir": output_dir, "machine.device_type": "cpu", "max_num_iterations": STEPS}
     trainer = prepare(override(method_configs()[method], changes | paths))
-    losses = [trainer.train_iteration(step) for step in range(STEPS)]
+    losses, seen = [], []
+    for step in range(STEPS):
+        losses.append(trainer.train_iteration(step))
+        if (grid := trainer.pipeline.model.grid) is not None:
+            seen += [float(grid.num_seen), float(grid.max_weight.sum())]
     trainer.next_step = STEPS
     trainer.save()
-    return losses
+    return losses, seen
 
 
 def start(world: int, *arguments: object) -> list[subprocess.Popen[str]]:
@@ -80,8 +85,9 @@ def finish(processes: list[subprocess.Popen[str]]) -> str:
 def check_same_losses(trainings: list[str], scene: Path, output_dir: Path) -> None:
     two = json.loads(finish(start(2, __file__, scene, output_dir / "two", *trainings)))
     for training in trainings:
-        one = losses_of(training, scene, output_dir / "one")
-        assert two[training] == pytest.approx(one, rel=1e-5), training
+        losses, seen = curves_of(training, scene, output_dir / "one")
+        assert two[training][0] == pytest.approx(losses, rel=1e-5), training
+        assert two[training][1] == pytest.approx(seen, rel=1e-3), training
     assert len(list(output_dir.glob("two/*/*/*/checkpoints/*.ckpt"))) == len(trainings)
 
 
@@ -134,6 +140,6 @@ def test_a_signal_to_any_process_and_the_clock_of_the_slowest_hold_for_all(scene
 
 if __name__ == "__main__":
     data, folder, *names = sys.argv[1:]
-    found = {name: losses_of(name, Path(data), Path(folder)) for name in names}
+    found = {name: curves_of(name, Path(data), Path(folder)) for name in names}
     if is_main():
         print(json.dumps(found))
