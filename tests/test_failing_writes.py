@@ -6,6 +6,7 @@ import builtins
 import errno
 import os
 import random
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -147,6 +148,7 @@ def test_commands_on_a_run_leave_what_was_there(
         pytest.importorskip("scipy")
     (tmp_path / "disk").mkdir()
     run = run.rename(tmp_path / "disk" / "run")
+    kept = shutil.copytree(run, tmp_path / "kept")
     files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     state = flat(state_of(run))
     command, *rest = (
@@ -160,6 +162,9 @@ def test_commands_on_a_run_leave_what_was_there(
             assert files == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
         else:
             assert state_of(run)["step"] >= state["step"]
+            disk.fail_after(None)
+            shutil.rmtree(run)
+            shutil.copytree(kept, run)
         number = number + 1 + number // (10 if some is None else 1) * 2
         disk.fail_after(number, [errno.ENOSPC, errno.EROFS, errno.EIO][number % 3])
     disk.fail_after(None)
