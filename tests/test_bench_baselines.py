@@ -104,6 +104,7 @@ def test_the_clock_stands_still_during_an_evaluation_and_while_others_read(monke
     assert clock.curve == [[3.0, 20.0], [7.5, 20.0], [10.5, 20.0]]
 
 
+@pytest.mark.slow
 def test_every_seed_is_trained_and_kept(data: Path, tmp_path: Path, edge_se: Any) -> None:
     program = checkout(tmp_path / "program", "run_nerf.py", NERF_PYTORCH)
     options = ["--program", "nerf-pytorch", "--checkout", program, "--output-dir", tmp_path, "--data", data.parent,

@@ -60,6 +60,7 @@ def test_trainings_that_are_compared_are_neighbors(tmp_path: Path) -> None:
 # -- a training
 
 
+@pytest.mark.slow
 def test_a_training_fills_its_time_and_is_evaluated_on_the_way(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "EVAL_SECONDS", (0.2, 0.4, 1.0, 1.5))
     run = train_and_evaluate(Trial("edge", "mic", 1), ChartSettings(seconds=4), data)
@@ -72,6 +73,7 @@ def test_a_training_fills_its_time_and_is_evaluated_on_the_way(data: Path, monke
     assert json.loads(json.dumps(run)) == run
 
 
+@pytest.mark.slow
 def test_lean_nerf_is_trained_anew_for_every_budget(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials_module, "BUDGETS", (0.7, 1, 3))
     run = train_and_evaluate(Trial("lean", "mic", 1), ChartSettings(seconds=2.5), data)
@@ -80,6 +82,7 @@ def test_lean_nerf_is_trained_anew_for_every_budget(data: Path, monkeypatch: pyt
     assert run["psnr"] == pytest.approx(run["curve"][-1][-1], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_peak_memory_is_the_trainings_alone(data: Path) -> None:
     run = run_in_subprocess(train_and_evaluate, Trial("lean", "mic", 1), ChartSettings(seconds=1), data)
     assert run["peak_bytes"] > 2**22
@@ -235,6 +238,7 @@ def test_curves_of_a_single_evaluation_are_drawn() -> None:
 # -- the command
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_report_and_goes_on(data: Path, tmp_path: Path, edge_se: Any) -> None:
     out = tmp_path / "out"
     options = ["--output-dir", out, "--data", data.parent, "--scenes", "mic", "--seeds", 0, "--seconds", 2]

@@ -27,6 +27,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "compiled_ops", lambda: None)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_demo_prints_its_result_and_leaves_pictures_a_page_and_a_json(tmp_path: Path, edge_se: Any) -> None:
     answer = edge_se("demo", "--output-dir", tmp_path / "seed-3", "--seed", 3)

@@ -114,6 +114,7 @@ def test_a_trial_is_measured_and_leaves_its_rendering(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_trial_gives_the_same_run_in_another_process(tmp_path: Path) -> None:
     trial = Trial(1, "mic", "vanilla-nerf", 0)
     data = synthetic_scene(1, "mic", SMALL, tmp_path)

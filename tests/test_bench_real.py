@@ -42,6 +42,7 @@ def test_a_training_is_measured_on_every_split(scenes: Path, tmp_path: Path) -> 
     assert 0.2 < run["memory"] < 4
 
 
+@pytest.mark.slow
 def test_a_capture_has_no_validation_views_of_its_own(tmp_path: Path) -> None:
     write_colmap(tmp_path / "scenes" / "mug")
     run = run_trial(Trial("mug", 2, "2s", "lean-nerf", 0), tmp_path / "scenes", tmp_path, Settings(num_train_views=1))

@@ -6,9 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from edge_se_sampler.bench.micro import scoring
 
 
+@pytest.mark.slow
 def test_the_command_compares_the_three_error_sources(
     scene: Path, tmp_path: Path, edge_se: Any, monkeypatch: Any
 ) -> None:

@@ -102,6 +102,7 @@ def test_the_other_views_make_the_mask_of_one_without_a_plain_background(
     assert min(iou(found[i], truth[i]) for i in range(COUNT) if i != 4) > 0.95
 
 
+@pytest.mark.slow
 def test_a_wall_and_a_table_are_background(images: list[np.ndarray], truth: list[np.ndarray]) -> None:
     rng = np.random.default_rng(3)
     some = [image.copy() for image in images]
@@ -229,6 +230,7 @@ def test_masks_lie_where_colmap_has_them(tmp_path: Path) -> None:
         place_of_mask(folder, folder.parent / "1.jpg")
 
 
+@pytest.mark.slow
 def test_an_object_that_moved_is_not_agreed_on(images: list[np.ndarray]) -> None:
     """Votes of wrong poses: nothing is left, rather than anything made up."""
     turned = [torch.from_numpy(image).roll(45, 1).numpy() if i % 2 else image for i, image in enumerate(images)]
