@@ -135,8 +135,8 @@ def test_help_is_complete_and_loads_no_torch(command: str):
     assert "usage: edge-se" in text
     if command == "train edge-se-nerf":
         choices = "".join(text.replace("│", "").split())  # however they are wrapped
-        for phase, auto in (("early", ",auto"), ("late", "")):
-            names = ",".join(strategy_names(phase)) + auto
+        early, late = strategy_names("early"), strategy_names("late")
+        for phase, names in (("early", ",".join((*early, "auto"))), ("late", ",".join(late))):
             assert f"--pipeline.datamanager.pixel-sampler.{phase}{{{names}}}" in choices
         assert text.count("--") > 35
 

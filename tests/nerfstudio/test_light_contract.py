@@ -166,7 +166,7 @@ def test_the_same_pixels_are_drawn_as_on_our_own_base(kind: str, strategy: str, 
 @pytest.mark.parametrize("kind", BATCHES)
 def test_strategies_that_learn_from_errors_draw_the_same_pixels_as_on_our_own_base(kind: str, name: str) -> None:
     batch, settings = BATCHES[kind](), {"early": name, "late": name, "images_per_step": "all"}
-    unweighted = {"soft_mining_alpha": 0.0} if name == "soft-mining" else {}
+    unweighted: dict[str, Any] = {"soft_mining_alpha": 0.0} if name == "soft-mining" else {}
     ours = bound(settings_module.EdgeSEPixelSamplerConfig(**settings, **unweighted))
     hosted = bound(EdgeSEPixelSamplerConfig(**settings))
     for step in range(3, 9):
