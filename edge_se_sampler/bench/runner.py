@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import re
 import shlex
 import signal
 import sys
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.machine import machine
+from edge_se_sampler.data.scene_file import quote, read_json
 from edge_se_sampler.engine.files import make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
@@ -102,17 +104,29 @@ def _command() -> str:
 
 def read_result(path: Path) -> dict[str, Any]:
     """A result.json; InputError if it cannot be read, or is no result of this version."""
+    result = read_json(path).object()
     try:
-        result = json.loads(path.read_text(encoding="utf-8"))
         if result["version"] != VERSION:
             raise ValueError(f"version {result['version']}, not {VERSION}")
         if not {"experiment", "command", "settings", "machine"} <= result.keys():
             raise KeyError("experiment, command, settings or machine")
         if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
             raise TypeError("runs and errors are lists of objects")
-    except (OSError, ValueError, KeyError, TypeError) as problem:
-        raise InputError(f"{path}: not a result of edge-se bench ({problem!r})") from problem
+        check_plain({key: value for key, value in result.items() if key != "errors"})
+    except (ValueError, KeyError, TypeError) as problem:
+        raise InputError(f"{path}: not a result of edge-se bench ({quote(problem)})") from problem
     return result
+
+
+def check_plain(value: Any) -> None:
+    """ValueError if a text in a json value, of which a page is made, could be more than text there: HTML, a link."""
+    if isinstance(value, dict):
+        check_plain([*value, *value.values()])
+    elif isinstance(value, list):
+        for item in value:
+            check_plain(item)
+    elif isinstance(value, str) and not re.fullmatch(r"[\w .,:;=+/()%'\"~@-]*(\n[\w .,:;=+/()%'\"~@-]+)*", value):
+        raise ValueError(f"a text with marks: {quote(value)}")
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:

@@ -152,12 +152,11 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 
 def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8: the largest color of the mask's pixels; it is turned as its image was."""
-    colors = read_image(file)[..., :3]  # without alpha: an opaque black mask still masks
-    height, width = image.shape[:2]
-    if colors.shape[:2] != (height, width):
-        problem = f"is {colors.shape[1]} x {colors.shape[0]} pixels, its image {width} x {height}"
+    (height, width), header = image.shape[:2], read_header(file)
+    if (header.height, header.width) != (height, width):  # before it is decoded, for it may be huge
+        problem = f"is {header.width} x {header.height} pixels, its image {width} x {height}"
         raise file.error(problem, "give the mask the size of its image")
-    return colors.max(axis=2)
+    return read_image(file)[..., :3].max(axis=2)  # without alpha: an opaque black mask still masks
 
 
 def _cameras(frames: Sequence[Frame], downscale: int) -> Cameras:

@@ -50,7 +50,7 @@ def _read_rows(path: Path) -> np.ndarray:
     data = SourceFile(path, location).read_bytes()
     try:
         rows = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False).astype(np.float64, casting="safe")
-    except (ValueError, TypeError, MemoryError):
+    except Exception:  # ValueError, TypeError, TokenError, RecursionError, ...: a header is Python text
         raise location.error(
             "is not a file of numbers as numpy saves them", "write it again with LLFF's tools"
         ) from None

@@ -107,6 +107,10 @@ def check_listed_once(files: Iterable[SourceFile]) -> None:
             raise file.error(f"is already the image of {other.location.field}", "list every image once")
 
 
+MAX_JSON = 2**27
+"""Bytes of a file: 100,000 cameras."""
+
+
 @dataclass(frozen=True)
 class JsonValue:
     """A json value and its location. All methods raise InputError, which names the location, for other values."""
@@ -171,6 +175,8 @@ class JsonValue:
 def read_json(path: Path) -> JsonValue:
     """The json object that a file holds; InputError if the file cannot be read or holds anything else."""
     location = SourceLocation(path)
+    if path.is_file() and path.stat().st_size > MAX_JSON:
+        raise location.error(f"has more than {MAX_JSON >> 20} MiB", "a json of cameras or settings is expected")
     data = SourceFile(path, location).read_bytes()
     try:
         value = json.loads(data.decode("utf-8-sig"))  # a byte order mark, which Windows editors add, does no harm
@@ -184,8 +190,8 @@ def read_json(path: Path) -> JsonValue:
     except ValueError:  # Python's limit on the digits of an integer
         raise location.error("has an integer of thousands of digits", "write numbers that fit a double") from None
     top = JsonValue(value, location)
-    _check_finite(top)
     top.object()
+    _check_finite(top)
     return top
 
 
@@ -194,10 +200,11 @@ def _check_finite(top: JsonValue) -> None:
     pending = [top]  # not recursive: the nesting may be deeper than Python's stack
     while pending:
         entry = pending.pop()
-        if isinstance(entry.value, dict):
-            pending += [JsonValue(item, entry.location.member(key)) for key, item in entry.value.items()]
-        elif isinstance(entry.value, list):
-            pending += entry.list()
-        elif isinstance(entry.value, float) and not math.isfinite(entry.value):
-            problem = "is NaN, Infinity or too large a number"
-            raise entry.location.error(problem, "every number in the file must be finite")
+        keyed = isinstance(entry.value, dict)
+        for key, item in entry.value.items() if keyed else enumerate(entry.value):
+            if isinstance(item, (dict, list)) or (isinstance(item, float) and not math.isfinite(item)):
+                location = entry.location.member(key) if keyed else entry.location.item(key)
+                if isinstance(item, float):
+                    problem = "is NaN, Infinity or too large a number"
+                    raise location.error(problem, "every number in the file must be finite")
+                pending.append(JsonValue(item, location))

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import io
-import pickle
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.engine.files import write_atomically
-from edge_se_sampler.errors import InputError, os_errors_as_input_errors
+from edge_se_sampler.engine.saved_state import check_archive, check_tensors
+from edge_se_sampler.errors import InputError
 
 MAGIC = b"edge-se-checkpoint 2 "
 NAMES = f"step-{9 * '[0-9]'}*.ckpt"
@@ -74,19 +75,25 @@ def latest_checkpoint(folder: Path) -> Path:
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     """Read a checkpoint; InputError if it is unreadable, damaged, none, or saved under another configuration."""
-    with os_errors_as_input_errors(f"{path}: cannot be read"):
-        content = path.read_bytes()
+    content = SourceFile(path, SourceLocation(path)).read_bytes()
     header, _, payload = content.partition(b"\n")
     if not header.startswith(MAGIC):
         raise InputError(f"{path}: not a checkpoint of this version of edge-se; use a run folder that it wrote")
     if header[len(MAGIC) :] != hashlib.sha256(payload).hexdigest().encode():
         raise InputError(f"{path}: truncated or changed since it was saved (checksum); restore it or train again")
     try:
+        check_archive(payload)
         state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as problem:
+    except MemoryError:
+        raise
+    except Exception as problem:  # whatever a pickle that was made for it brings torch to raise
         raise InputError(f"{path}: holds more than tensors and numbers (a pickle), which is never loaded") from problem
     if not isinstance(state, dict) or state.get("config_digest") != config_digest:
         raise InputError(f"{path}: saved under another configuration than the run's config.json; do not mix runs")
+    try:
+        check_tensors(state)
+    except ValueError as problem:
+        raise InputError(f"{path}: was not saved by a training ({problem}); do not use it") from problem
     return state
 
 

@@ -21,6 +21,7 @@ from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights,
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.saved_state import check_parts
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig, apply_preset, decide_size
@@ -82,6 +83,7 @@ def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | N
     config = replace(config, max_seconds=max_seconds)
     config.check()
     state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
+    check_parts(state, config.pipeline.model)
     trainer = prepare(config, run, saved_grid(state["model"]))
     trainer.resume(state)
     return trainer
@@ -91,6 +93,7 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     """A run's model with the weights of its last checkpoint, and that checkpoint; InputError if it is bad."""
     checkpoint = latest_checkpoint(run.checkpoints)
     state = load_checkpoint(checkpoint, config_digest(config))
+    check_parts(state, config.pipeline.model)
     model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
     load_weights(model, state["model"])
     return model, checkpoint

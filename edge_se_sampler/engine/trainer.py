@@ -25,6 +25,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
 from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
+from edge_se_sampler.engine.saved_state import check_training
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
@@ -73,6 +74,7 @@ class Trainer:
     def resume(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint's state; InputError if it is another model's."""
         load_weights(self.pipeline.model, state["model"])
+        check_training(state, self)
         if state["optimizer"] is not None:  # of a run that has ended
             self.optimizer.load_state_dict(state["optimizer"])
         self.plan.load_state_dict(state["plan"])

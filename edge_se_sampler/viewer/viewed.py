@@ -17,6 +17,7 @@ from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.saved_state import check_parts, check_sampler
 from edge_se_sampler.engine.session import choose_device, read_train_views
 from edge_se_sampler.engine.show import probability_map
 from edge_se_sampler.engine.trainer import Trainer
@@ -61,6 +62,7 @@ class Viewed:
     def load(cls, run: RunFolder, config: TrainerConfig) -> Viewed:
         """A run at its last checkpoint; nothing is written. InputError for a bad run or data."""
         state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
+        check_parts(state, config.pipeline.model)
         device, views = choose_device(config.machine.device_type), read_train_views(config)
         pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
         load_weights(pipeline.model, state["model"])
@@ -74,6 +76,7 @@ class Viewed:
         path = latest_checkpoint(trainer.run.checkpoints)
         if path.stem != f"step-{trainer.next_step - 1:09d}":
             state = load_checkpoint(path, config_digest(trainer.config))
+            check_parts(state, trainer.config.pipeline.model)
             model = build_model(trainer.config, str(trainer.pipeline.model.device), saved_grid(state["model"]))
             load_weights(model, state["model"])
             self._take(state, model)
@@ -81,6 +84,7 @@ class Viewed:
     def _take(self, state: dict[str, Any], model: Any) -> None:
         """Show a checkpoint's model, and its sampler."""
         trainer, manager = self.trainer, self.trainer.pipeline.datamanager
+        check_sampler(state["sampler"], manager)
         with self.turns:
             trainer.pipeline, trainer.next_step = replace(trainer.pipeline, model=model), state["step"] + 1
             manager.load_state_dict(state["sampler"])

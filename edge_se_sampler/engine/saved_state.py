@@ -1,0 +1,204 @@
+"""What a checkpoint may hold. Its checksum says that nobody changed it by accident; whoever made it knows that, too.
+
+Checked are a file's archive before anything is unpacked, its tensors before any is copied, and what a training
+continues from before a kernel, which knows no bounds, sees it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickletools
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
+
+GLOBALS = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2"} | {
+    f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Byte", "Bool")
+}
+"""Names that torch's pickles of tensors, numbers, texts, lists and dicts have."""
+PARTS = {
+    *("step", "elapsed", "config_digest", "model", "plan"),
+    *("optimizer", "scheduler", "dead_network_reset", "sampler"),
+}
+MAX_STEP = 2**40
+
+
+def check_archive(payload: bytes) -> None:
+    """ValueError, or one of zipfile's, for what is not torch's archive of plain tensors, or is larger once unpacked."""
+    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+        entries = archive.infolist()
+        stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+        if not stored or sum(entry.file_size for entry in entries) > len(payload):
+            raise ValueError("it is larger once unpacked")
+        for entry in entries:
+            if entry.filename.endswith(".pkl"):
+                _check_pickle(archive.read(entry))
+
+
+def _check_pickle(data: bytes) -> None:
+    for code, argument, _ in pickletools.genops(data):
+        if code.name in ("STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4") or (
+            code.name == "GLOBAL" and argument not in GLOBALS
+        ):
+            raise ValueError(f"{code.name} {argument}")
+
+
+def check_tensors(state: Any) -> None:
+    """ValueError for a tensor that is not plain, has more elements than numbers, or a number that is not finite."""
+    pending, seen = [state], set()
+    while pending:  # not recursive: a pickle may be nested as deeply as it is long
+        value = pending.pop()
+        if id(value) in seen:
+            continue
+        seen.add(id(value))
+        if isinstance(value, dict):
+            pending += value.values()
+        elif isinstance(value, (list, tuple)):
+            pending += value
+        elif isinstance(value, Tensor):
+            _check_tensor(value)
+
+
+def _check_tensor(value: Tensor) -> None:
+    if value.layout != torch.strided or value.device.type != "cpu":
+        raise ValueError("a tensor of another layout")
+    if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+        raise ValueError("a tensor that repeats its numbers")
+    if value.is_floating_point() and value.numel() and not torch.stack(torch.aminmax(value)).isfinite().all():
+        raise ValueError("a number that is not finite")
+
+
+def check_parts(state: dict[str, Any], config: ModelConfig) -> None:
+    """InputError if a checkpoint has other parts than a training saves, or fewer weights than the config's model has:
+    memory is asked for none that are not there."""
+    weights = state.get("model")
+    valid = (
+        set(state) == PARTS
+        and isinstance(weights, dict)
+        and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())
+        and all(isinstance(state[name], dict) for name in ("plan", "scheduler", "sampler"))
+        and type(state["step"]) is int
+        and 0 <= state["step"] < MAX_STEP
+        and _is_finite(state["elapsed"])
+    )
+    if valid and isinstance(config, NeRFModelConfig):
+        depth, width = config.preset.depth, config.preset.width
+        valid = depth <= len(weights) and (depth - 1) * width**2 <= sum(value.numel() for value in weights.values())
+    if not valid:
+        raise _other_training()
+
+
+def check_training(state: Mapping[str, Any], trainer: Any) -> None:
+    """InputError if a trainer cannot continue from a checkpoint's state; its weights are the trainer's model's."""
+    optimizer, scheduler, reset = (state[key] for key in ("optimizer", "scheduler", "dead_network_reset"))
+    own = trainer.scheduler.state_dict()
+    own_reset = None if trainer.dead_network_reset is None else trainer.dead_network_reset.state_dict()
+    plan, decided = state["plan"], trainer.plan.state_dict()
+    valid = (
+        _is_alike(plan, decided)
+        and len(plan["segments"]) <= 100
+        and all(0 <= length < MAX_STEP for length in plan["segments"])
+        and _is_alike({key: scheduler.get(key, own[key]) for key in own}, own)
+        and scheduler["last_epoch"] == state["step"] + 1
+        and _is_alike(reset, own_reset)
+        and (optimizer is None or _is_optimizer(optimizer, trainer.optimizer))
+    )
+    if not valid:
+        raise _other_training()
+    check_sampler(state["sampler"], trainer.pipeline.datamanager)
+
+
+def check_sampler(state: Mapping[str, Any], manager: Any) -> None:
+    """InputError if a data manager's sampler cannot continue from a state."""
+    images = {number: tuple(image.shape[:2]) for number, image in enumerate(manager.image_batch["image"])}
+    for name, own in manager.state_dict().items():
+        found = state.get(name)
+        if not (_is_error_map(found, images) if "sizes" in own else _is_alike(found, own)):
+            raise _other_training()
+    if not state.keys() <= manager.state_dict().keys():
+        raise _other_training()
+
+
+def _other_training() -> InputError:
+    return InputError("the checkpoint is not of a training by this run's config.json; begin a new training")
+
+
+def _is_optimizer(state: Any, optimizer: torch.optim.Optimizer) -> bool:
+    own = optimizer.state_dict()
+    if not (
+        isinstance(state, dict)
+        and state.keys() == own.keys()
+        and len(state["param_groups"]) == len(own["param_groups"])
+    ):
+        return False
+    for group, own_group in zip(state["param_groups"], own["param_groups"], strict=True):
+        if not all(group[key] == own_group[key] for key in group.keys() & own_group.keys() - {"lr"}):
+            return False
+        if not (group.keys() <= own_group.keys() and _is_finite(group["lr"]) and group["lr"] >= 0):
+            return False
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    return isinstance(state["state"], dict) and all(
+        number in range(len(weights)) and _are_moments(moments, weights[number])
+        for number, moments in state["state"].items()
+    )
+
+
+def _are_moments(moments: Any, weight: Tensor) -> bool:
+    """Whether Adam's running means are those of a weight."""
+    if not isinstance(moments, dict) or set(moments) != {"step", "exp_avg", "exp_avg_sq"}:
+        return False
+    mean, square = moments["exp_avg"], moments["exp_avg_sq"]
+    shapes = weight.shape, weight[..., :1].shape  # of sparse gradients one for a row
+    steps = moments["step"]
+    return (
+        all(isinstance(value, Tensor) and value.is_floating_point() for value in (mean, square, steps))
+        and mean.shape == weight.shape
+        and square.shape in shapes
+        and steps.shape == ()
+    )
+
+
+def _is_error_map(state: Any, images: Mapping[int, tuple[int, int]]) -> bool:
+    """Whether an `ErrorMap` over (some of) the images can have that state."""
+    if not isinstance(state, dict) or set(state) != {"sizes", "values", "updated", "sum"}:
+        return False
+    values, updated = state["values"], state["updated"]
+    known = all(images.get(size[0]) == tuple(size[1:]) for size in state["sizes"])
+    return (
+        known
+        and len({size[0] for size in state["sizes"]}) == len(state["sizes"])
+        and isinstance(values, Tensor)
+        and isinstance(updated, Tensor)
+        and (values.dtype, updated.dtype) == (torch.float32, torch.int32)
+        and values.shape == updated.shape
+        and _is_finite(state["sum"])
+    )
+
+
+def _is_alike(found: Any, own: Any) -> bool:
+    """Whether a value is of another's kind: dicts have the same keys, numbers are finite."""
+    if isinstance(own, dict):
+        same = isinstance(found, dict) and found.keys() == own.keys()
+        return same and all(_is_alike(found[key], own[key]) for key in own)
+    if isinstance(own, (list, tuple)):
+        if not isinstance(found, (list, tuple)):
+            return False
+        if not own:
+            return all(type(item) is int for item in found)
+        return len(found) == len(own) and all(map(_is_alike, found, own))
+    if isinstance(own, str):
+        return found in ("early", "late")  # of phases alone
+    if isinstance(own, (int, float)):
+        return _is_finite(found)
+    return found is None and own is None
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and abs(value) < MAX_STEP**2 and math.isfinite(value)
