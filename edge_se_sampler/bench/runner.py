@@ -29,6 +29,8 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError
 
 VERSION = 2
+PLAIN = re.compile(r"[\w .,:;=+/()%'\"~@-]*")
+"""Texts without marks of Markdown and HTML."""
 MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
@@ -112,20 +114,27 @@ def read_result(path: Path) -> dict[str, Any]:
             raise KeyError("experiment, command, settings or machine")
         if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
             raise TypeError("runs and errors are lists of objects")
-        check_plain({key: value for key, value in result.items() if key != "errors"})
+        check_texts(result)
     except (ValueError, KeyError, TypeError) as problem:
         raise InputError(f"{path}: not a result of edge-se bench ({quote(problem)})") from problem
     return result
 
 
+def check_texts(result: dict[str, Any]) -> None:
+    """ValueError or TypeError if a result's texts could be more than that in a page, see `check_plain`."""
+    check_plain({key: value for key, value in result.items() if key not in ("errors", "command")})
+    check_plain([line.replace("..", "") for line in str(result["command"]).splitlines()])  # paths of one's own
+
+
 def check_plain(value: Any) -> None:
-    """ValueError if a text in a json value, of which a page is made, could be more than text there: HTML, a link."""
+    """ValueError if a text in a json value could be more than text in a page or a file's name: HTML, a link, a path that
+    leads out."""
     if isinstance(value, dict):
         check_plain([*value, *value.values()])
     elif isinstance(value, list):
         for item in value:
             check_plain(item)
-    elif isinstance(value, str) and not re.fullmatch(r"[\w .,:;=+/()%'\"~@-]*(\n[\w .,:;=+/()%'\"~@-]+)*", value):
+    elif isinstance(value, str) and (".." in value or not PLAIN.fullmatch(value)):
         raise ValueError(f"a text with marks: {quote(value)}")
 
 

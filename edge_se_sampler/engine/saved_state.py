@@ -18,6 +18,7 @@ from torch import Tensor
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
+from edge_se_sampler.sampling.error_map import ErrorMap
 
 GLOBALS = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2"} | {
     f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Byte", "Bool")
@@ -166,20 +167,20 @@ def _are_moments(moments: Any, weight: Tensor) -> bool:
 
 
 def _is_error_map(state: Any, images: Mapping[int, tuple[int, int]]) -> bool:
-    """Whether an `ErrorMap` over (some of) the images can have that state."""
+    """Whether an `ErrorMap` of some of the images can have that state."""
     if not isinstance(state, dict) or set(state) != {"sizes", "values", "updated", "sum"}:
         return False
-    values, updated = state["values"], state["updated"]
-    known = all(images.get(size[0]) == tuple(size[1:]) for size in state["sizes"])
-    return (
-        known
-        and len({size[0] for size in state["sizes"]}) == len(state["sizes"])
-        and isinstance(values, Tensor)
-        and isinstance(updated, Tensor)
-        and (values.dtype, updated.dtype) == (torch.float32, torch.int32)
-        and values.shape == updated.shape
-        and _is_finite(state["sum"])
-    )
+    listed = state["sizes"]
+    if not isinstance(listed, list) or not _is_alike(listed, [[0, 0, 0]] * len(listed)):
+        return False
+    sizes = {size[0]: tuple(size[1:]) for size in listed}
+    if len(sizes) != len(listed) or any(images.get(number) != size for number, size in sizes.items()):
+        return False
+    error_map = ErrorMap()
+    error_map.add({number: images[number] for number in sizes})
+    kinds = {"values": torch.float32, "updated": torch.int32}
+    tensors = all(isinstance(state[name], Tensor) and state[name].dtype == kind for name, kind in kinds.items())
+    return tensors and all(state[name].shape == (len(error_map),) for name in kinds) and _is_finite(state["sum"])
 
 
 def _is_alike(found: Any, own: Any) -> bool:
@@ -201,4 +202,4 @@ def _is_alike(found: Any, own: Any) -> bool:
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and abs(value) < MAX_STEP**2 and math.isfinite(value)
+    return type(value) in (int, float) and abs(value) < MAX_STEP**2 and math.isfinite(value)
