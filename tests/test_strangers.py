@@ -20,7 +20,7 @@ import pytest
 import torch
 from blender_folder import chunk, png
 from capture_folder import NAMES, write_images, write_transforms
-from strangers import change_config, change_state, contents, make_runs, memory_bound, replace_payload
+from strangers import change_config, change_state, contents, memory_bound, replace_payload
 
 from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint
 
@@ -28,19 +28,14 @@ BOUND = 2**30
 CONFIGS = Path(__file__).parent.parent / "configs"
 
 
-@pytest.fixture(scope="session")
-def _runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return make_runs(tmp_path_factory.mktemp("strangers"))
+@pytest.fixture
+def nerf(stranger_runs: dict[str, Path], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(stranger_runs["edge-se-nerf"], tmp_path / "nerf"))
 
 
 @pytest.fixture
-def nerf(_runs: dict[str, Path], tmp_path: Path) -> Path:
-    return Path(shutil.copytree(_runs["edge-se-nerf"], tmp_path / "nerf"))
-
-
-@pytest.fixture
-def lean(_runs: dict[str, Path], tmp_path: Path) -> Path:
-    return Path(shutil.copytree(_runs["lean-nerf"], tmp_path / "lean"))
+def lean(stranger_runs: dict[str, Path], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(stranger_runs["lean-nerf"], tmp_path / "lean"))
 
 
 @pytest.fixture
@@ -285,7 +280,7 @@ RESULTS: dict[str, Callable[[dict], object]] = {
     "the end of a block": lambda result: result.update(command="```\n# x"),
     "a picture as processor": lambda result: result["machine"].update(processor="![x](http://x)"),
     "a path": lambda result: result["runs"][0].update(scene="../../x"),
-    "no numbers": lambda result: result["runs"][0].update(psnr="x", outcome="converged"),
+    "no numbers": lambda result: result["runs"][0].update(curve=["x"]),
     "a variant that is a list": lambda result: result["runs"][0].update(variant=["x"]),
     "no settings": lambda result: result.update(settings=[]),
     "a run that is none": lambda result: result["runs"].append(3),

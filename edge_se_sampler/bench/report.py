@@ -40,6 +40,7 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
     report = report_of(folder)
     try:
         if hasattr(report, "draw"):
+            report.describe(folder)  # what cannot be described is not drawn either
             report.draw(folder, workplace)
         text = report.describe(folder)
         tables = report.tables(folder) if readme is not None and hasattr(report, "tables") else {}

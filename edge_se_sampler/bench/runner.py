@@ -127,8 +127,8 @@ def check_texts(result: dict[str, Any]) -> None:
 
 
 def check_plain(value: Any) -> None:
-    """ValueError if a text in a json value could be more than text in a page or a file's name: HTML, a link, a path that
-    leads out."""
+    """ValueError if a text in a json value could be more than text in a page or the name of a file: HTML, a link, a
+    path that leads out."""
     if isinstance(value, dict):
         check_plain([*value, *value.values()])
     elif isinstance(value, list):

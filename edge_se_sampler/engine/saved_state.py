@@ -197,7 +197,7 @@ def _is_alike(found: Any, own: Any) -> bool:
     if isinstance(own, str):
         return found in ("early", "late")  # of phases alone
     if isinstance(own, (int, float)):
-        return _is_finite(found)
+        return type(found) is bool if type(own) is bool else _is_finite(found)
     return found is None and own is None
 
 
