@@ -20,8 +20,8 @@ from capture_folder import NAMES, colmap_files, transforms, write_images
 from strangers import contents, memory_bound, replace_payload
 from torch import Tensor
 
-from edge_se_sampler.bench.report import report_of, write_report
-from edge_se_sampler.data.dataset import DataSettings, list_frames, read_split
+from edge_se_sampler.bench.report import write_report
+from edge_se_sampler.data.dataset import list_frames, read_split
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.session import load_model, prepare_resume
@@ -178,7 +178,7 @@ class Folders:
             path = next((self.scene / "train").iterdir())
             with kept(path) as good:
                 path.write_bytes(change_bytes(good, rng))
-                read_split(self.scene, "train", DataSettings())
+                read_split(self.scene, "train")
             return
         if name == "transforms":
             value = transforms()
@@ -237,15 +237,9 @@ def step(run: Path, copies: Path) -> None:
         shutil.rmtree(copied)
 
 
-def describe(folder: Path) -> None:
-    text = report_of(folder)
-    del text
-    write_report(folder)
-
-
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> Folders:
-    return Folders(tmp_path_factory.mktemp("fuzz"))
+def folders(stranger_runs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Folders:
+    return Folders(tmp_path_factory.mktemp("fuzz"), stranger_runs)
 
 
 def attack(case: Callable[[random.Random], None], seed: int) -> None:
@@ -296,7 +290,7 @@ def test_ten_thousand_changes(part: int, folders: Folders, tmp_path: Path) -> No
         (150, partial(folders.checkpoint, use=resume)),
         (50, folders.metrics),
         (225, folders.capture),
-        (25, partial(folders.result, use=describe)),
+        (25, partial(folders.result, use=write_report)),
     ]
     for count, case in cases:
         for seed in range(1000 + part * count, 1000 + (part + 1) * count):
