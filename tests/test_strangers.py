@@ -15,11 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from blender_folder import chunk, png
-from capture_folder import NAMES, write_images, write_transforms
+from capture_folder import NAMES, write_colmap, write_images, write_transforms
 from strangers import change_config, change_state, contents, memory_bound, replace_payload
 
 from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint
@@ -260,14 +259,12 @@ def test_poses_that_are_no_numbers(attack: str, tmp_path: Path, refused: Callabl
 
 def test_images_and_masks_that_lead_out(tmp_path: Path, refused: Callable) -> None:
     folder, outside = tmp_path / "scene", tmp_path / "outside"
-    folder.mkdir()
-    write_images(outside)
-    np.save(folder / "poses_bounds.npy", np.zeros((9, 17)))
+    write_colmap(folder)
+    (folder / "images").rename(outside)
     os.symlink(outside, folder / "images")
-    refused("inspect", "--data", folder)
+    assert "leads out of the folder" in refused("inspect", "--data", folder)
     (folder / "images").unlink()
-    (folder / "poses_bounds.npy").unlink()
-    write_transforms(folder)
+    outside.rename(folder / "images")
     (tmp_path / "empty").mkdir()
     os.symlink(tmp_path / "empty", folder / "masks")
     assert "masks is there already" in refused("masks", "--data", folder)

@@ -257,9 +257,9 @@ def attack(case: Callable[[random.Random], None], seed: int) -> None:
 
 
 CHEAP: dict[str, tuple[int, Callable[[Folders], Callable[[random.Random], None]]]] = {
-    "config": (60, lambda folders: partial(folders.config, use=load)),
-    "checkpoint": (60, lambda folders: partial(folders.checkpoint, use=load)),
-    "metrics": (60, lambda folders: folders.metrics),
+    "config": (40, lambda folders: partial(folders.config, use=load)),
+    "checkpoint": (50, lambda folders: partial(folders.checkpoint, use=load)),
+    "metrics": (40, lambda folders: folders.metrics),
     "capture": (100, lambda folders: folders.capture),
 }
 """How many of each, and what."""

@@ -144,7 +144,8 @@ def config_digest(config: TrainerConfig) -> str:
 
 def config_from_json(default: Any, values: Any, where: str) -> Any:
     """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped."""
-    hints = {field.name: get_type_hints(type(default))[field.name] for field in dataclasses.fields(default)}
+    types = get_type_hints(type(default))
+    hints = {field.name: types[field.name] for field in dataclasses.fields(default)}
     if not isinstance(values, dict) or set(values) != set(hints):
         differing = quote(sorted(set(values) ^ set(hints)) if isinstance(values, dict) else "not an object")
         raise InputError(f"{where}: written by another version of edge-se or edited by hand (fields: {differing})")
