@@ -24,6 +24,8 @@ from edge_se_sampler.errors import InputError
 
 Progress = Callable[[int, int], None]
 """Called with the number of images read so far, and of all."""
+MAX_MISFIT = 2**22
+"""Pixels of a mask of another size than its image, up to which it is decoded: it may be damaged, too."""
 MAX_REMAPPED = 2**15 - 2
 """Pixels, of a side: OpenCV undistorts no larger images."""
 
@@ -153,10 +155,14 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8: the largest color of the mask's pixels; it is turned as its image was."""
     (height, width), header = image.shape[:2], read_header(file)
-    if (header.height, header.width) != (height, width):  # before it is decoded, for it may be huge
-        problem = f"is {header.width} x {header.height} pixels, its image {width} x {height}"
-        raise file.error(problem, "give the mask the size of its image")
-    return read_image(file)[..., :3].max(axis=2)  # without alpha: an opaque black mask still masks
+    found = header.height, header.width
+    if found == (height, width) or header.height * header.width <= MAX_MISFIT:
+        colors = read_image(file)[..., :3]  # without alpha: an opaque black mask still masks
+        found = colors.shape[:2]
+        if found == (height, width):
+            return colors.max(axis=2)
+    problem = f"is {found[1]} x {found[0]} pixels, its image {width} x {height}"
+    raise file.error(problem, "give the mask the size of its image")
 
 
 def _cameras(frames: Sequence[Frame], downscale: int) -> Cameras:

@@ -190,8 +190,8 @@ def read_json(path: Path) -> JsonValue:
     except ValueError:  # Python's limit on the digits of an integer
         raise location.error("has an integer of thousands of digits", "write numbers that fit a double") from None
     top = JsonValue(value, location)
-    top.object()
     _check_finite(top)
+    top.object()
     return top
 
 
@@ -200,11 +200,21 @@ def _check_finite(top: JsonValue) -> None:
     pending = [top]  # not recursive: the nesting may be deeper than Python's stack
     while pending:
         entry = pending.pop()
-        keyed = isinstance(entry.value, dict)
-        for key, item in entry.value.items() if keyed else enumerate(entry.value):
-            if isinstance(item, (dict, list)) or (isinstance(item, float) and not math.isfinite(item)):
-                location = entry.location.member(key) if keyed else entry.location.item(key)
-                if isinstance(item, float):
-                    problem = "is NaN, Infinity or too large a number"
-                    raise location.error(problem, "every number in the file must be finite")
-                pending.append(JsonValue(item, location))
+        if _is_infinite(entry.value):
+            problem = "is NaN, Infinity or too large a number"
+            raise entry.location.error(problem, "every number in the file must be finite")
+        # other values have no location made for them: of millions, these would take memory
+        if isinstance(entry.value, dict):
+            items = entry.value.items()
+            pending += [JsonValue(item, entry.location.member(key)) for key, item in items if _is_looked_into(item)]
+        elif isinstance(entry.value, list):
+            items = enumerate(entry.value)
+            pending += [JsonValue(item, entry.location.item(i)) for i, item in items if _is_looked_into(item)]
+
+
+def _is_looked_into(value: Any) -> bool:
+    return isinstance(value, (dict, list)) or _is_infinite(value)
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
