@@ -45,7 +45,9 @@ def places(value: Any, path: tuple = ()) -> Iterator[tuple]:
 
 def change_value(value: Any, rng: random.Random) -> None:
     """Replace, remove or repeat something in a nested value."""
-    path = rng.choice(list(places(value)))
+    path = rng.choice(list(places(value)) or [()])
+    if not path:
+        return
     for key in path[:-1]:
         value = value[key]
     key, old = path[-1], value[path[-1]]
@@ -65,6 +67,8 @@ def change_value(value: Any, rng: random.Random) -> None:
 
 def changed_tensor(tensor: Tensor, rng: random.Random) -> Any:
     """Another shape, type or number."""
+    if tensor.numel() > 2**24:  # it repeats its numbers already
+        return tensor
     ways: list[Callable[[], Any]] = [
         lambda: tensor.double(),
         lambda: tensor.to(torch.int16),
@@ -79,7 +83,7 @@ def changed_tensor(tensor: Tensor, rng: random.Random) -> Any:
         integer = not changed.dtype.is_floating_point
         number = int(min(max(number, -(2**62)), 2**62)) if integer and number == number else 3 if integer else number
         limits = {torch.uint8: 255, torch.int32: 2**31 - 1}
-        number = min(number, 3e38) if not integer else number
+        number = number if integer else float(min(number, 3e38))
         changed.view(-1)[rng.randrange(tensor.numel())] = min(number, limits.get(changed.dtype, number))
         return changed
     return rng.choice(ways)()

@@ -10,12 +10,13 @@ import io
 import math
 import pickletools
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from edge_se_sampler.engine.plan import NUM_SEGMENTS
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
 from edge_se_sampler.sampling.error_map import ErrorMap
@@ -98,33 +99,47 @@ def check_parts(state: dict[str, Any], config: ModelConfig) -> None:
 
 def check_training(state: Mapping[str, Any], trainer: Any) -> None:
     """InputError if a trainer cannot continue from a checkpoint's state; its weights are the trainer's model's."""
-    optimizer, scheduler, reset = (state[key] for key in ("optimizer", "scheduler", "dead_network_reset"))
-    own = trainer.scheduler.state_dict()
-    own_reset = None if trainer.dead_network_reset is None else trainer.dead_network_reset.state_dict()
-    plan, decided = state["plan"], trainer.plan.state_dict()
-    valid = (
-        _is_alike(plan, decided)
-        and len(plan["segments"]) <= 100
-        and all(0 <= length < MAX_STEP for length in plan["segments"])
-        and _is_alike({key: scheduler.get(key, own[key]) for key in own}, own)
-        and scheduler["last_epoch"] == state["step"] + 1
-        and _is_alike(reset, own_reset)
-        and (optimizer is None or _is_optimizer(optimizer, trainer.optimizer))
-    )
-    if not valid:
-        raise _other_training()
+    _require(_is_training, state, trainer)
     check_sampler(state["sampler"], trainer.pipeline.datamanager)
 
 
 def check_sampler(state: Mapping[str, Any], manager: Any) -> None:
     """InputError if a data manager's sampler cannot continue from a state."""
-    images = {number: tuple(image.shape[:2]) for number, image in enumerate(manager.image_batch["image"])}
-    for name, own in manager.state_dict().items():
-        found = state.get(name)
-        if not (_is_error_map(found, images) if "sizes" in own else _is_alike(found, own)):
-            raise _other_training()
-    if not state.keys() <= manager.state_dict().keys():
+    _require(_is_sampler, state, manager)
+
+
+def _require(is_valid: Callable[..., bool], *arguments: Any) -> None:
+    try:
+        valid = is_valid(*arguments)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError):
+        valid = False  # of a kind that was not expected there
+    if not valid:
         raise _other_training()
+
+
+def _is_training(state: Mapping[str, Any], trainer: Any) -> bool:
+    optimizer, scheduler, reset = (state[key] for key in ("optimizer", "scheduler", "dead_network_reset"))
+    own = trainer.scheduler.state_dict()
+    own_reset = None if trainer.dead_network_reset is None else trainer.dead_network_reset.state_dict()
+    segments = state["plan"]["segments"]
+    return (
+        _is_alike(state["plan"], trainer.plan.state_dict() | {"segments": [0] * len(segments)})
+        and len(segments) <= NUM_SEGMENTS
+        and all(0 <= length < MAX_STEP for length in segments)
+        and _is_alike({key: scheduler.get(key, own[key]) for key in own}, own)
+        and scheduler["last_epoch"] == state["step"] + 1
+        and _is_alike(reset, own_reset)
+        and (optimizer is None or _is_optimizer(optimizer, trainer.optimizer))
+    )
+
+
+def _is_sampler(state: Mapping[str, Any], manager: Any) -> bool:
+    own = manager.state_dict()
+    images = {number: tuple(image.shape[:2]) for number, image in enumerate(manager.image_batch["image"])}
+    return state.keys() == own.keys() and all(
+        _is_error_map(state[name], images) if "sizes" in part else _is_alike(state[name], part)
+        for name, part in own.items()
+    )
 
 
 def _other_training() -> InputError:
@@ -191,8 +206,6 @@ def _is_alike(found: Any, own: Any) -> bool:
     if isinstance(own, (list, tuple)):
         if not isinstance(found, (list, tuple)):
             return False
-        if not own:
-            return all(type(item) is int for item in found)
         return len(found) == len(own) and all(map(_is_alike, found, own))
     if isinstance(own, str):
         return found in ("early", "late")  # of phases alone
