@@ -90,6 +90,7 @@ TRAININGS = {
     "moments of another shape": lambda state: state["optimizer"]["state"][0].update(exp_avg=torch.zeros(1)),
     "moments of an unknown weight": lambda state: state["optimizer"]["state"].update({99: {}}),
     "an optimizer of other settings": lambda state: state["optimizer"]["param_groups"][0].update(capturable=True),
+    "a group without epsilon": lambda state: state["optimizer"]["param_groups"][0].pop("eps"),
     "groups that are none": lambda state: state["optimizer"].update(param_groups=[3]),
     "a learning rate that is none": lambda state: state["optimizer"]["param_groups"][0].update(lr="high"),
     "a scheduler of other steps": lambda state: state["scheduler"].update(last_epoch=-(10**9)),

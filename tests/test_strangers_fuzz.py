@@ -45,9 +45,10 @@ def places(value: Any, path: tuple = ()) -> Iterator[tuple]:
 
 def change_value(value: Any, rng: random.Random) -> None:
     """Replace, remove or repeat something in a nested value."""
-    path = rng.choice(list(places(value)) or [()])
-    if not path:
+    paths = list(places(value))
+    if not paths:
         return
+    path = rng.choice(paths)
     for key in path[:-1]:
         value = value[key]
     key, old = path[-1], value[path[-1]]

@@ -29,6 +29,8 @@ PARTS = {
     *("step", "elapsed", "config_digest", "model", "plan"),
     *("optimizer", "scheduler", "dead_network_reset", "sampler"),
 }
+GROUP = {"params", "lr", "betas", "eps", "weight_decay", "amsgrad", "initial_lr", "maximum", "total_variation"}
+"""What Adam's groups have in every version of torch, and ours."""
 MAX_STEP = 2**40
 
 
@@ -80,7 +82,7 @@ def _check_tensor(value: Tensor) -> None:
 def check_parts(state: dict[str, Any], config: ModelConfig) -> None:
     """InputError if a checkpoint has other parts than a training saves, or fewer weights than the config's model has:
     memory is asked for none that are not there."""
-    weights = state.get("model")
+    weights: Any = state.get("model")
     valid = (
         set(state) == PARTS
         and isinstance(weights, dict)
@@ -157,7 +159,7 @@ def _is_optimizer(state: Any, optimizer: torch.optim.Optimizer) -> bool:
     for group, own_group in zip(state["param_groups"], own["param_groups"], strict=True):
         if not all(group[key] == own_group[key] for key in group.keys() & own_group.keys() - {"lr"}):
             return False
-        if not (group.keys() <= own_group.keys() and _is_finite(group["lr"]) and group["lr"] >= 0):
+        if not (GROUP <= group.keys() <= own_group.keys() and _is_finite(group["lr"]) and group["lr"] >= 0):
             return False
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     return isinstance(state["state"], dict) and all(
