@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler, ImportantPixels
     from edge_se_sampler.sampling.random_streams import Stream, stream
     from edge_se_sampler.sampling.ranking import Selection, sample_by_rank
+    from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, PixelStrategy
     from edge_se_sampler.sampling.schedule import AdaptiveSchedule, FixedSchedule
     from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-    from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, SELECTORS
 
 __version__ = "0.1.0"
 
@@ -37,9 +37,9 @@ _NAMES = {
     "sampling.pixel_sampler": ["EdgeSEPixelSampler", "ImportantPixels"],
     "sampling.random_streams": ["Stream", "stream"],
     "sampling.ranking": ["Selection", "sample_by_rank"],
+    "sampling.registry": ["PIXEL_STRATEGIES", "PixelStrategy"],
     "sampling.schedule": ["AdaptiveSchedule", "FixedSchedule"],
     "sampling.settings": ["EdgeSEPixelSamplerConfig"],
-    "sampling.strategies": ["DISTRIBUTIONS", "SELECTORS"],
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 

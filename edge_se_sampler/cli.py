@@ -18,7 +18,8 @@ from edge_se_sampler.run_commands import Training
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; exit code 2 for bad input, 1 for a training that diverged, 130 for Ctrl-C."""
+    """Run a command; exit code 2 for bad input, 1 for a training that diverged or lost
+    one of its processes, 130 for Ctrl-C."""
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's, before it is imported: large pages for large tensors
     try:
         try:
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(141)  # as a shell reports SIGPIPE
     except InputError as problem:
         _exit(str(problem), 2)
-    except FloatingPointError as problem:
+    except (FloatingPointError, ConnectionError) as problem:
         _exit(str(problem), 1)
     except (MemoryError, RuntimeError) as problem:
         if not _is_out_of_memory(problem):

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Literal
 
 from edge_se_sampler.data.config import DataFormat
 from edge_se_sampler.data.config import Masks as MeaningOfMasks
-from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.config import PipelineConfig, TrainerConfig
 from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.config import LeanModelConfig, ModelConfig, NeRFModelConfig
 from edge_se_sampler.run_commands import Eval, Export, Render, Resume, View
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
@@ -110,11 +110,13 @@ class _Data:
     downscale: int = 1
     """Average every DOWNSCALE x DOWNSCALE pixels first, as in training."""
 
-    def _read(self) -> Views:
+    def _read(self, model: ModelConfig) -> Views:
+        """The training views; `model` is what they are to be trained with."""
         from edge_se_sampler.engine.session import read_train_views
 
         names = ("data", "data_format", "masks", "eval_every", "downscale")
-        return read_train_views(TrainerConfig(**{name: getattr(self, name) for name in names}))
+        settings = {name: getattr(self, name) for name in names}
+        return read_train_views(TrainerConfig(**settings, pipeline=PipelineConfig(model=model)))
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ class Show(_Data):
         check_value("num-views", self.num_views, self.num_views >= 1, "at least 1")
         check_value("pixel-sampler.num-rays-per-batch", rays, rays >= 1, "at least 1")
         check_output(self.output_path)
-        views = self._read()
+        views = self._read(NeRFModelConfig())
         config = EdgeSEPixelSamplerConfig(**vars(self.pixel_sampler))
         show(views, config, self.strategy, self.output_path, self.num_views, self.seed)
         print(self.output_path)
@@ -181,7 +183,7 @@ class Inspect(_Data):
 
         check_output(self.output_path)
         config = LeanModelConfig(near=self.near, far=self.far, voxel_size_px=self.voxel_size_px)
-        print(inspect(self._read(), config, self.output_path))
+        print(inspect(self._read(config), config, self.output_path))
         print(self.output_path)
 
 
@@ -191,6 +193,8 @@ class Masks:
 
     data: Path
     """Folder of images and cameras; the masks are written into it, as `masks/` or beside images_2 as `masks_2/`."""
+    out: Path | None = None
+    """Write `masks/` into this folder instead, where --data may not be written to."""
     data_format: DataFormat = "auto"
     """Insist on a format where a folder has several."""
     output_path: Path = Path("masks.png")
@@ -200,7 +204,7 @@ class Masks:
         from edge_se_sampler.data.dataset import DataSettings
         from edge_se_sampler.masks.command import make_masks
 
-        print(make_masks(self.data, DataSettings(self.data_format), self.output_path))
+        print(make_masks(self.data, DataSettings(self.data_format), self.output_path, self.out))
 
 
 @dataclass(frozen=True)

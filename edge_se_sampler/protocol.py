@@ -14,6 +14,9 @@ from enum import Enum, auto
 from importlib import import_module
 from typing import Any, ClassVar, Protocol
 
+ADDED_LATER = {"added_later": True}
+"""Metadata of a config field that runs of earlier versions lack: there its default stands for it."""
+
 
 class InstantiateConfig:
     """A config that builds the object that it configures."""

@@ -12,6 +12,7 @@ import tyro
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.ranks import is_main
 from edge_se_sampler.viewer.address import ViewerConfig, check_viser
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Training:
         from edge_se_sampler.engine.session import prepare
 
         trainer = prepare(self.config)
-        if not self.view:
+        if not (self.view and is_main()):
             train(trainer)
             return
         from edge_se_sampler.viewer.server import view_training
@@ -55,15 +56,19 @@ class _RunCommand:
 
 @dataclass(frozen=True)
 class Resume(_RunCommand):
-    """Continue an interrupted run in place, under its own settings."""
+    """Continue an interrupted run in place, under its own settings, or extend a finished one."""
 
     max_seconds: float | None = None
     """Stop this session after so many seconds."""
+    max_num_iterations: int | None = None
+    """Planned iterations from now on, which the learning rate follows; the early phase keeps its length."""
+    changed_data: bool = False
+    """Train on, although the training images are not those that the run began with."""
 
     def run(self) -> None:
         from edge_se_sampler.engine.session import prepare_resume
 
-        train(prepare_resume(*self._load(), self.max_seconds))
+        train(prepare_resume(*self._load(), self.max_seconds, self.max_num_iterations, self.changed_data))
 
 
 @dataclass(frozen=True)
@@ -152,13 +157,19 @@ def train(trainer: Any) -> None:
     """Train, and say where the result is. Exits with 130 if it was stopped by Ctrl-C."""
     from edge_se_sampler.engine.session import describe_run
 
-    print(describe_run(trainer), flush=True)
+    if is_main():
+        print(describe_run(trainer), flush=True)
     trainer.train()
+    if not is_main():
+        sys.exit(130 if trainer.stop_requested else 0)
     resume = f"edge-se resume {trainer.run.path}"
     if trainer.stop_requested:
         print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
         sys.exit(130)
     print(f"{trainer.next_step} of {trainer.plan.num_steps or '?'} iterations in {trainer.elapsed:.1f} s of training")
+    stopping = trainer.early_stopping
+    if stopping.is_due:
+        print(f"stopped: no gain of {stopping.min_gain:g} dB in the last {stopping.patience} previews")
     print(f"measure it: edge-se eval {trainer.run.path}")
     if trainer.next_step != trainer.plan.num_steps:
         print(f"continue:   {resume}")

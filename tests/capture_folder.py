@@ -67,6 +67,13 @@ def write_images(folder: Path) -> None:
         iio.imwrite(folder / name, picture(i))
 
 
+def turned_jpeg(image: np.ndarray, orientation: int) -> bytes:
+    """A JPEG with an EXIF orientation."""
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+    data = iio.imwrite("<bytes>", image, extension=".jpg", quality=100)
+    return data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+
+
 def transforms(distortion: Distortion = PINHOLE) -> dict[str, Any]:
     """A transforms.json of images/."""
     frames = [{"file_path": f"images/{NAMES[i]}", "transform_matrix": p.tolist()} for i, p in enumerate(poses())]
@@ -156,6 +163,21 @@ def write_colmap(
     for name, data in files.items():
         (folder / sparse / name).write_bytes(data)
     return files
+
+
+def bounds(scale: float = 1.0) -> np.ndarray:
+    """(COUNT, 17): LLFF's poses, found with images that were `scale` times as large, and depths from 2 to 8."""
+    rows = []
+    for pose in poses():
+        right, up, back, position = pose[:3].T
+        size = np.array([HEIGHT, WIDTH, FX]) * scale
+        rows.append(np.concatenate((np.stack((-up, right, back, position, size), axis=1).reshape(-1), [2.0, 8.0])))
+    return np.array(rows)
+
+
+def write_llff(folder: Path, rows: np.ndarray) -> None:
+    write_images(folder / "images")
+    np.save(folder / "poses_bounds.npy", rows)
 
 
 def read(folder: Path, split: Any = "train", **settings: Any) -> Views:

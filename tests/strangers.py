@@ -54,7 +54,7 @@ def change_state(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 def replace_payload(run: Path, payload: bytes) -> None:
     """Other bytes in a run's checkpoint, with their checksum."""
-    digest = hashlib.sha256(payload).hexdigest().encode()
+    digest = hashlib.sha256(MAGIC + payload).hexdigest().encode()
     latest_checkpoint(run / "checkpoints").write_bytes(MAGIC + digest + b"\n" + payload)
 
 
@@ -63,6 +63,7 @@ def change_config(run: Path, change: Callable[[dict[str, Any]], object]) -> None
     path, states = run / "config.json", []
     change_state(run, lambda state: states.append(dict(state)))
     config = json.loads(path.read_text())
+    del config["checksum"]
     change(config)
     path.write_text(json.dumps(config))
     try:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.nerfstudio.report import describe
-from edge_se_sampler.bench.runner import VERSION
+from edge_se_sampler.bench.runner import write_result
 
 
 def run(method: str, seed: int, psnr: float, outcome: str) -> dict[str, Any]:
     return {"method": method, "seed": seed, "psnr": psnr, "outcome": outcome}
 
 
-def write_result(folder: Path) -> None:
+def write_runs(folder: Path) -> None:
     result: dict[str, Any] = {
-        "version": VERSION,
         "experiment": "nerfstudio",
         "command": "edge-se bench nerfstudio",
         "errors": [],
@@ -29,11 +27,11 @@ def write_result(folder: Path) -> None:
             run("edge-se-nerf", 0, 25.0, "converged"),
         ],
     }
-    (folder / "result.json").write_text(json.dumps(result))
+    write_result(folder / "result.json", result)
 
 
 def test_failures_are_counted_by_method(tmp_path: Path) -> None:
-    write_result(tmp_path)
+    write_runs(tmp_path)
     readme = describe(tmp_path)
     assert "uniform pixels | 2 of 3 | 1 | 20.40 dB |" in readme
     assert "Edge + SE | 0 of 1 | 0 | 25.00 dB |" in readme

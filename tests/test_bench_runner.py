@@ -18,10 +18,13 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.bench.runner import (
+    VERSION,
     Experiment,
     Run,
+    Shard,
     executor_factory,
     list_trials,
+    read_result,
     run_experiment,
     run_in_subprocess,
 )
@@ -68,9 +71,9 @@ def read(folder: Path) -> dict[str, Any]:
 
 def test_result_json_holds_the_head_and_every_run_sorted(tmp_path: Path) -> None:
     result = run_experiment(toy_experiment(trials=lambda _: TRIALS[::-1]), tmp_path / "new", one_thread)
-    assert read(tmp_path / "new") == json.loads(json.dumps(result))
+    assert read_result(tmp_path / "new" / "result.json") == json.loads(json.dumps(result))
     assert result["runs"] == [{"scene": "mic", "seed": seed, "psnr": 20.0 + seed} for seed in range(3)]
-    assert (result["version"], result["experiment"], result["settings"]) == (2, "toy", {"steps": 3})
+    assert (result["version"], result["experiment"], result["settings"]) == (VERSION, "toy", {"steps": 3})
     assert result["command"].startswith("edge-se ")
     assert result["errors"] == []
 
@@ -158,6 +161,50 @@ def test_listing_trials_trains_and_writes_nothing(tmp_path: Path, capsys: pytest
     assert (tmp_path / "result.json").read_bytes() == before
     list_trials(toy_experiment(), tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+# -- shards
+
+
+def test_shards_train_each_trial_once_and_are_put_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained = []
+
+    def count(trial: ToyTrial) -> Run:
+        trained.append(trial)
+        return train(trial)
+
+    for name, expected in (("1/2", [0, 2]), ("2/2", [1]), ("1/2", [])):
+        trained.clear()
+        monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy", "--shard", name])
+        run_experiment(toy_experiment(count), tmp_path, one_thread, Shard.parse(name))
+        assert [trial.seed for trial in trained] == expected
+    assert not (tmp_path / "result.json").exists()
+    (tmp_path / "shards" / "1-of-2.json").rename(tmp_path / "shards" / "of_another_machine.json")
+    monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy"])
+    result = run_experiment(toy_experiment(lambda _: pytest.fail("trained")), tmp_path, one_thread)
+    assert read(tmp_path) == json.loads(json.dumps(result))
+    assert [run["psnr"] for run in result["runs"]] == [20.0, 21.0, 22.0]
+    commands = ["edge-se bench toy --shard 1/2", "edge-se bench toy --shard 2/2", "edge-se bench toy"]
+    assert sorted(result["command"].splitlines()) == sorted(commands)
+
+
+def test_what_a_killed_shard_lacks_is_trained_by_the_call_that_puts_together(tmp_path: Path) -> None:
+    run_experiment(toy_experiment(), tmp_path, one_thread, Shard(2, 3))
+    trained = []
+    run_experiment(toy_experiment(lambda trial: trained.append(trial.seed) or train(trial)), tmp_path, one_thread)
+    assert trained == [0, 2]
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "1/0", "2", "a/b", "-1/2"])
+def test_a_shard_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="--shard"):
+        Shard.parse(text)
+
+
+def test_a_shard_of_other_settings_is_refused(tmp_path: Path) -> None:
+    run_experiment(toy_experiment(steps=4), tmp_path, one_thread, Shard(1, 2))
+    with pytest.raises(InputError, match="of another experiment or other settings"):
+        run_experiment(toy_experiment(), tmp_path, one_thread)
 
 
 # -- processes

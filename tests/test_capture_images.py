@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from capture_folder import (
     Distortion,
     picture,
     read,
+    turned_jpeg,
     write_colmap,
     write_transforms,
 )
@@ -28,6 +30,8 @@ from edge_se_sampler.data import memory
 from edge_se_sampler.data.lens import find_sources
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.nerf import NeRFModel
 
 
 def half_mask() -> np.ndarray:
@@ -89,12 +93,6 @@ def test_rays_of_downscaled_images(tmp_path: Path) -> None:
     )
 
 
-def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
-    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
-    data = iio.imwrite("<bytes>", image, extension=".jpg", quality=100)
-    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
-
-
 @pytest.mark.parametrize(("orientation", "stored"), [
     (6, lambda image: np.rot90(image)), (8, lambda image: np.rot90(image, -1)),
     (5, lambda image: image.swapaxes(0, 1)), (7, lambda image: np.rot90(image, 2).swapaxes(0, 1)),
@@ -102,7 +100,7 @@ def write_turned(path: Path, image: np.ndarray, orientation: int) -> None:
 def test_orientations_are_applied_where_the_size_says_so(orientation: int, stored: Any, tmp_path: Path) -> None:
     write_colmap(tmp_path)
     for i, name in enumerate(NAMES):
-        write_turned(tmp_path / "images" / name, stored(picture(i)), orientation)
+        (tmp_path / "images" / name).write_bytes(turned_jpeg(stored(picture(i)), orientation))
     difference = read(tmp_path).images[0].astype(int) - picture(1)
     assert np.abs(difference).mean() < 4  # JPEG's
 
@@ -110,23 +108,82 @@ def test_orientations_are_applied_where_the_size_says_so(orientation: int, store
 def test_orientations_that_the_camera_ignored(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     for i, name in enumerate(NAMES):
-        write_turned(tmp_path / "images" / name, picture(i), 6)
+        (tmp_path / "images" / name).write_bytes(turned_jpeg(picture(i), 6))
     assert np.abs(read(tmp_path).images[0].astype(int) - picture(1)).mean() < 4
 
 
 def test_orientations_that_may_mean_either_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path)
-    write_turned(tmp_path / "images" / NAMES[3], picture(3), 3)
+    (tmp_path / "images" / NAMES[3]).write_bytes(turned_jpeg(picture(3), 3))
     with pytest.raises(InputError, match=r"images\[3\]: .*EXIF orientation 3"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("turned_image", [False, True])
+def test_a_masks_own_orientation_is_applied(turned_image: bool, tmp_path: Path) -> None:
+    """Whether or not its image has one."""
+    write_colmap(tmp_path)
+    if turned_image:
+        (tmp_path / "images" / NAMES[1]).write_bytes(turned_jpeg(np.rot90(picture(1)), 6))
+    (tmp_path / "masks").mkdir()
+    mask = tmp_path / "masks" / NAMES[1]
+    mask.write_bytes(turned_jpeg(np.rot90(half_mask()), 6))
+    masks = read(tmp_path).masks
+    assert masks is not None
+    assert masks[0][:, :20].all()  # JPEG's blocks blur the edge between
+    assert not read(tmp_path, masks="object").images[0][:, 32:, 3].any()
+    mask.write_bytes(turned_jpeg(half_mask(), 3))
+    with pytest.raises(InputError, match=r"images\[1\]: .*EXIF orientation 3"):
         read(tmp_path)
 
 
 def test_more_than_the_machine_has_is_refused_before_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_transforms(tmp_path)
-    monkeypatch.setattr(memory, "available_memory", lambda: 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + 20))
+    monkeypatch.setattr(memory, "MIN_SIDE", 8)
     monkeypatch.setattr("edge_se_sampler.data.frames.read_image", None)  # would not be callable
-    with pytest.raises(InputError, match=r"transforms\.json: its 7 images take .*; give --downscale 3"):
-        read(tmp_path)
+    third = 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + 20)
+    for available, of_pixel, remedy in (
+        (third, 0, "give --downscale 3"),
+        (third, 200, "give --downscale 4"),  # the model's is in proportion to the longest side
+        (third // 100, 0, "give fewer images"),
+        (third, third, "train a smaller model"),
+    ):
+        monkeypatch.setattr(memory, "available_memory", lambda available=available: available)
+        with pytest.raises(InputError, match=rf"transforms\.json: training on its 7 images takes .*; {remedy}"):
+            read(tmp_path, model_memory=lambda longest, of_pixel=of_pixel: of_pixel * longest)
+
+
+def test_what_training_takes_is_known_of_views_that_were_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_transforms(tmp_path)
+    monkeypatch.setattr(memory, "available_memory", lambda: 3 * 2**30)
+    of_model = read(tmp_path, model_memory=lambda longest: longest * 2**23).subset([0, 2])
+    assert of_model.memory == "images 0.1 MiB, tables 0.2 MiB, model up to 0.4 GiB; 3.0 GiB available"
+    assert read(tmp_path, downscale=2).memory == "images 0.0 MiB, tables 0.1 MiB; 3.0 GiB available"
+
+
+@pytest.mark.parametrize("size", ["paper", "small", "tiny"])
+def test_weights_and_their_moments_are_in_the_estimate(size: Any) -> None:
+    config = NeRFModelConfig(size=size)
+    weights = sum(weight.numel() for weight in NeRFModel(config, np.random.default_rng(0)).parameters())
+    of_points = 2 * 4 * config.preset.width * (config.preset.depth + 2) * 2**14
+    assert 16 * weights < config.training_memory - of_points < 1.5 * 16 * weights
+
+
+def test_train_and_inspect_say_what_training_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edge_se: Any
+) -> None:
+    write_transforms(tmp_path / "scene")
+    monkeypatch.setattr(memory, "available_memory", lambda: 3 * 2**30)
+    flags = ["--data", tmp_path / "scene"]
+    training = ["--output-dir", tmp_path, "--max-num-iterations", "1", "--machine.device-type", "cpu"]
+    answers = [
+        edge_se("inspect", *flags, "--output-path", tmp_path / "x.png"),
+        edge_se("train", "lean-nerf", *flags, *training),
+    ]
+    found = [re.search(r"^memory +(.*)$", answer.out, re.MULTILINE) for answer in answers]
+    assert [match and match[1] for match in found] == [
+        "images 0.1 MiB, tables 0.2 MiB, model up to 0.2 GiB; 3.0 GiB available"
+    ] * 2
 
 
 @pytest.mark.parametrize(("limit", "expected"), [("1000", 700), ("400", 100), ("max", None)])

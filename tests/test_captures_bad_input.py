@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import os
 import re
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -15,12 +17,17 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from capture_folder import (
+    COUNT,
+    HEIGHT,
     NAMES,
     OPENCV,
     PINHOLE,
+    WIDTH,
+    bounds,
     colmap_files,
     picture,
     transforms,
+    turned_jpeg,
     write_colmap,
     write_images,
     write_transforms,
@@ -29,7 +36,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from edge_se_sampler.data.dataset import DataSettings, read_split
+from edge_se_sampler.engine.pipeline import resolve_depths
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.occupancy.hull import find_box
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -81,6 +91,16 @@ def put(document: dict[str, Any], key: str, value: Any) -> None:
         ("frames 4 file_path", f"images/{NAMES[3]}", "already the image of"),
         ("frames 4 transform_matrix", [[1, 0], [0, 1]], "4 rows of 4"),
         ("frames", {}, "frames: must be a list"),
+        ("fl_x", 1e300, r"frames\[1\]\.file_path: .* focal length is 1e\+300"),
+        ("frames 2 fl_y", 1e-9, r"frames\[2\]\.file_path: .* focal length is 1e-09"),
+        ("fl_x", 0, "fl_x: must be positive"),
+        ("fl_x", -40, "fl_x: must be positive"),
+        ("frames 3 cy", -1e9, r"frames\[3\]\.file_path: .* principal point at 23, -1e\+09"),
+        ("w", 10**9, "w: is 1000000000, but"),
+        ("frames 4 transform_matrix 0 3", 1e300, r"frames\[4\]\.file_path: .* camera at 1e\+300"),
+        ("frames 4 file_path", "images/\0.png", "characters that no file name can have"),
+        ("frames 4 mask_path", "images/\0.png", "characters that no file name can have"),
+        ("frames 4 mask_path", "x" * 5000, "cannot be read .file name too long"),
     ],
 )
 def test_a_bad_field_of_transforms_json(key: str, value: Any, says: str, tmp_path: Path) -> None:
@@ -91,6 +111,28 @@ def test_a_bad_field_of_transforms_json(key: str, value: Any, says: str, tmp_pat
         assert re.search(says, refusal(tmp_path))
     else:
         assert read_split(tmp_path, "train") is not None
+
+
+def test_a_name_that_is_too_long_is_of_an_image_that_is_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = write_transforms(tmp_path, PINHOLE)
+    put(document, "frames 4 file_path", "x" * 5000)
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    views = read_split(tmp_path, "train")
+    assert views is not None
+    assert len(views.names) == 7
+    assert "1 of the 9 listed images do not exist" in capsys.readouterr().err
+
+
+def test_cameras_too_far_from_the_origin_to_be_told_apart(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path, PINHOLE)
+    for frame in document["frames"]:
+        frame["transform_matrix"][0][3] += 5e6
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert re.search(
+        r"transforms.json: its cameras are 5e\+06 from the origin, but only .* from each", refusal(tmp_path)
+    )
 
 
 def test_a_fisheye_has_no_tangential_terms(tmp_path: Path) -> None:
@@ -152,6 +194,8 @@ def test_a_bad_binary_model(name: str, change: Callable[[bytes], bytes], says: s
         ("cameras.txt", b"40.0", b"forty", "line 2: has '.*' where numbers belong"),
         ("cameras.txt", b" 19.5", b"", "has 3 parameters, PINHOLE has 4"),
         ("cameras.txt", b"7 PINHOLE 48 36", b"7 PINHOLE", "pixels|parameters"),
+        ("cameras.txt", b"48 36", b"1000000000 750000000", "whole numbers from 1"),
+        ("images.txt", b"view 00", b"view\0 00", "line 1: has characters that no file name can have"),
         ("images.txt", b"1 ", b"", "line 1: "),
         ("images.txt", b" 7 view 00", b" 9 view 00", "line 1: there is no camera 9"),
         ("images.txt", b"1.5 2.5 3 ", b"1.5 2.5 x ", "where numbers belong"),
@@ -167,6 +211,13 @@ def test_a_bad_text_model(name: str, old: bytes, new: bytes, says: str, tmp_path
     message = refusal(tmp_path)
     assert name in message
     assert re.search(says, message)
+
+
+@pytest.mark.parametrize("focal", [b"1e300", b"1e-300", b"1e9"])
+def test_a_focal_length_of_a_model_that_no_camera_has(focal: bytes, tmp_path: Path) -> None:
+    files = write_colmap(tmp_path, text=True)
+    (tmp_path / "sparse/0/cameras.txt").write_bytes(files["cameras.txt"].replace(b"40.0", focal))
+    assert re.search(r"images.txt: line 3: 'view 01.png' is of 48 x 36 pixels, .*focal length is 1e", refusal(tmp_path))
 
 
 def test_a_model_without_images(tmp_path: Path) -> None:
@@ -232,9 +283,13 @@ def test_nothing_is_written_and_the_exit_code_is_2(tmp_path: Path, edge_se: Call
 
 
 def accept(folder: Path) -> None:
-    """Views or an InputError of one line: anything else is raised."""
+    """Views of which a scene can be found, or an InputError of one line: anything else is raised."""
     try:
-        read_split(folder, "train")
+        views = read_split(folder, "train")
+        assert views is not None
+        config, _ = resolve_depths(views, LeanModelConfig(size="tiny", max_memory=1.0))
+        config.check()
+        find_box(views, *config.depths)
     except InputError as problem:
         check_message(str(problem))
 
@@ -242,11 +297,40 @@ def accept(folder: Path) -> None:
 HYPOTHESIS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
+@HYPOTHESIS
+@given(data=st.data())
+def test_any_change_of_llffs_bounds(data: st.DataObject, images: Path) -> None:
+    rows = bounds()
+    for _ in range(data.draw(st.integers(1, 3))):
+        rows[data.draw(st.integers(0, COUNT - 1)), data.draw(st.integers(0, 16))] = data.draw(NUMBERS)
+    saved = io.BytesIO()
+    np.save(saved, rows)
+    clear(images)
+    (images / "poses_bounds.npy").write_bytes(data.draw(mutated(saved.getvalue(), most=120)))
+    accept(images)
+
+
+@HYPOTHESIS
+@given(data=st.data())
+def test_any_change_of_a_mask(data: st.DataObject, images: Path) -> None:
+    """A PNG, or a JPEG that says how to turn it."""
+    clear(images)
+    (images / "transforms.json").write_text(json.dumps(transforms(PINHOLE)))
+    shape = data.draw(st.sampled_from([(HEIGHT, WIDTH), (WIDTH, HEIGHT), (3, 3)]))
+    mask = np.zeros(shape, data.draw(st.sampled_from([np.uint8, np.uint16])))
+    mask[:2] = 255
+    content = iio.imwrite("<bytes>", mask, extension=".png")
+    if data.draw(st.booleans()):
+        content = turned_jpeg(mask.astype(np.uint8), data.draw(st.integers(1, 9)))
+    (images / "masks").mkdir(exist_ok=True)
+    (images / "masks" / f"{NAMES[1]}.png").write_bytes(data.draw(mutated(content, most=80)))
+    accept(images)
+
+
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mutated")
     write_images(folder / "images")
-    (folder / "sparse").mkdir()
     return folder
 
 
@@ -254,6 +338,28 @@ VALUES = st.one_of(
     st.none(), st.booleans(), st.integers(-3, 50), st.floats(), st.text(max_size=5), st.just([]), st.just({}),
     st.sampled_from([1e308, -1e308, 1e-308, 2**70, "../x", "images", "/", [[1]], [0.0] * 4]),
 )  # fmt: skip
+
+
+NUMBERS = st.one_of(st.floats(), st.sampled_from([0.0, -1.0, 1e-300, 1e9, 1e300]))
+
+
+def clear(folder: Path) -> None:
+    """Leave the images alone."""
+    for path in folder.iterdir():
+        if path.is_dir() and path.name != "images":
+            shutil.rmtree(path)
+        elif path.is_file():
+            path.unlink()
+
+
+@st.composite
+def mutated(draw: st.DrawFn, content: bytes, most: int) -> bytes:
+    """Bytes of which some are replaced, among the first `most`, or the last ones are missing; or all as they are."""
+    changed = bytearray(content)
+    for _ in range(draw(st.integers(0, 3))):
+        start = draw(st.integers(0, min(len(changed), most)))
+        changed[start : start + draw(st.integers(0, 9))] = draw(st.binary(max_size=9))
+    return bytes(changed[: draw(st.integers(0, len(changed)))] if draw(st.booleans()) else changed)
 
 
 def _places(value: Any, path: tuple = ()) -> list[tuple]:
@@ -274,8 +380,7 @@ def test_any_change_of_a_json(name: str, data: st.DataObject, images: Path) -> N
             target[path[-1]] = copy.deepcopy(data.draw(VALUES))
         except (TypeError, KeyError, IndexError):
             continue  # an earlier change took that place
-    for other in ("transforms.json", "transforms_train.json"):
-        (images / other).unlink(missing_ok=True)
+    clear(images)
     (images / name).write_text(json.dumps(document))
     accept(images)
 
@@ -284,20 +389,11 @@ def test_any_change_of_a_json(name: str, data: st.DataObject, images: Path) -> N
 @HYPOTHESIS
 @given(data=st.data())
 def test_any_change_of_a_model(text: bool, data: st.DataObject, images: Path) -> None:
-    for other in ("transforms.json", "transforms_train.json"):
-        (images / other).unlink(missing_ok=True)
-    for file in (images / "sparse").iterdir():
-        file.unlink()
+    clear(images)
+    (images / "sparse").mkdir()
     files = colmap_files(OPENCV, text)
     changed = data.draw(st.sampled_from(sorted(files)))
-    content = bytearray(files[changed])
-    for _ in range(data.draw(st.integers(1, 3))):
-        start = data.draw(st.integers(0, min(len(content), 400)))
-        length = data.draw(st.integers(0, 9))
-        content[start : start + length] = data.draw(st.binary(max_size=9))
-    if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content)))]
-    files[changed] = bytes(content)
+    files[changed] = data.draw(mutated(files[changed], most=400))
     for name, value in files.items():
         (images / "sparse" / name).write_bytes(value)
     accept(images)

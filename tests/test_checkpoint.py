@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint, load_checkpoint, save_checkpoint
+from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint, load_checkpoint, load_latest, save_checkpoint
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 
@@ -23,12 +23,48 @@ def state(value: float, digest: str = "d") -> dict:
     return {"step": 1, "config_digest": digest, "model": {"w": torch.full((50, 50), value)}}
 
 
-def test_the_latest_checkpoint_is_loaded_and_older_ones_are_deleted(tmp_path: Path):
-    save_checkpoint(tmp_path, 9, state(1.0))
-    save_checkpoint(tmp_path, 19, state(2.0))
-    assert [path.name for path in tmp_path.iterdir()] == ["step-000000019.ckpt"]
-    loaded = load_checkpoint(latest_checkpoint(tmp_path), "d")
-    assert torch.equal(loaded["model"]["w"], torch.full((50, 50), 2.0))
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def flip(path: Path, position: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1
+    path.write_bytes(content)
+
+
+def test_the_latest_checkpoint_is_loaded_and_the_one_before_is_kept(tmp_path: Path):
+    for i in (9, 19, 29):
+        (tmp_path / f".step-{i - 5:09d}.ckpt.tmp").touch()  # of a killed process
+        save_checkpoint(tmp_path, i, state(float(i)))
+    assert names(tmp_path) == ["step-000000019.ckpt", "step-000000029.ckpt"]
+    path, loaded = load_latest(tmp_path, "d")
+    assert path.name == "step-000000029.ckpt"
+    assert torch.equal(loaded["model"]["w"], torch.full((50, 50), 29.0))
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_that_is_said(tmp_path: Path, capsys):
+    before, newest = (save_checkpoint(tmp_path, i, state(float(i))) for i in (9, 19))
+    flip(newest, 2000)
+    path, loaded = load_latest(tmp_path, "d")
+    assert (path, float(loaded["model"]["w"][0, 0])) == (before, 9.0)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert newest.name in said
+    assert before.name in said
+    save_checkpoint(tmp_path, 12, state(12.0))  # what is trained after the one before takes the damaged one's place
+    assert names(tmp_path) == ["step-000000009.ckpt", "step-000000012.ckpt"]
+    for path in tmp_path.iterdir():
+        flip(path, 2000)
+    with pytest.raises(InputError, match=r"step-000000012\.ckpt: truncated or changed"):
+        load_latest(tmp_path, "d")
+
+
+def test_another_configuration_does_not_fall_back(tmp_path: Path):
+    for i, digest in ((9, "d"), (19, "e")):
+        save_checkpoint(tmp_path, i, state(1.0, digest))
+    with pytest.raises(InputError, match="another configuration"):
+        load_latest(tmp_path, "d")
 
 
 def test_the_latest_checkpoint_has_the_highest_step(tmp_path: Path):
@@ -39,12 +75,10 @@ def test_the_latest_checkpoint_has_the_highest_step(tmp_path: Path):
     assert latest_checkpoint(tmp_path).name == "step-1000000000.ckpt"
 
 
-@pytest.mark.parametrize("position", [0, 30, 84, 85, 200, -1])
+@pytest.mark.parametrize("position", [0, 19, 30, 84, 85, 200, -1])
 def test_a_flipped_bit_is_refused(tmp_path: Path, position: int):
     path = save_checkpoint(tmp_path, 1, state(1.0))
-    content = bytearray(path.read_bytes())
-    content[position] ^= 1
-    path.write_bytes(content)
+    flip(path, position)
     with pytest.raises(InputError, match=r"step-000000001\.ckpt: (truncated or changed|not a checkpoint)"):
         load_checkpoint(path, "d")
 
@@ -78,7 +112,7 @@ def test_a_pickle_is_refused_and_never_run(tmp_path: Path, monkeypatch: pytest.M
         payload_path.write_bytes(pickle.dumps(Bomb()))
     payload = payload_path.read_bytes()
     path = tmp_path / "step-000000001.ckpt"
-    path.write_bytes(MAGIC + hashlib.sha256(payload).hexdigest().encode() + b"\n" + payload)
+    path.write_bytes(MAGIC + hashlib.sha256(MAGIC + payload).hexdigest().encode() + b"\n" + payload)
     with pytest.raises(InputError, match="pickle"):
         load_checkpoint(path, "d")
     assert not (tmp_path / "exploded").exists()

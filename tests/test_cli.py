@@ -17,6 +17,7 @@ from tiny import SMALL
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.commands import COMMANDS
 from edge_se_sampler.methods import STRATEGIES
+from edge_se_sampler.sampling.registry import strategy_names
 
 
 def test_a_run_folder_has_config_metrics_checkpoint_and_previews(run: Path):
@@ -133,7 +134,10 @@ def test_help_is_complete_and_loads_no_torch(command: str):
     text = subprocess.run(arguments, check=True, capture_output=True, text=True, env=environment).stdout
     assert "usage: edge-se" in text
     if command == "train edge-se-nerf":
-        assert "--pipeline.datamanager.pixel-sampler.early {uniform,precrop,edge,auto}" in text
+        choices = "".join(text.replace("│", "").split())  # however they are wrapped
+        for phase, auto in (("early", ",auto"), ("late", "")):
+            names = ",".join(strategy_names(phase)) + auto
+            assert f"--pipeline.datamanager.pixel-sampler.{phase}{{{names}}}" in choices
         assert text.count("--") > 35
 
 

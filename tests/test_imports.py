@@ -14,7 +14,7 @@ import pytest
 PACKAGE = "edge_se_sampler"
 ROOT = Path(__file__).parent.parent / PACKAGE
 LAYERS = [
-    ("errors", "protocol"),
+    ("errors", "protocol", "ranks"),
     ("sampling",),
     ("",),  # the package itself: the public API
     ("data",),
@@ -25,6 +25,7 @@ LAYERS = [
     ("nerfstudio", "bench", "export", "viewer", "masks"),
     ("commands", "run_commands"),
     ("cli",),
+    ("__main__",),
 ]
 """Files and folders of the package. Each may import from its own layer and from earlier ones."""
 HEAVY = {"torch", "numba", "cv2", "matplotlib", "tyro", "imageio", "nerfstudio", "viser"}
@@ -118,6 +119,7 @@ def modules_loaded_by(code: str) -> set[str]:
         ("errors", set()),
         ("protocol", set()),
         ("sampling.random_streams", set()),
+        ("sampling.registry", set()),
         ("sampling.settings", set()),
         ("methods", {"tyro"}),
         ("sampling.edges", {"cv2"}),

@@ -8,28 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from capture_folder import HEIGHT, NAMES, WIDTH, poses, read, write_colmap, write_images
+from capture_folder import FX, HEIGHT, NAMES, WIDTH, bounds, poses, read, write_colmap, write_images, write_llff
 
 from edge_se_sampler.data.dataset import DataSettings, find_format, read_split
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.occupancy.depths import find_depths
-
-FOCAL = 40.0
-
-
-def bounds(scale: float = 1.0) -> np.ndarray:
-    """(n, 17): the capture's poses, found with images that were `scale` times as large."""
-    rows = []
-    for pose in poses():
-        right, up, back, position = pose[:3].T
-        size = np.array([HEIGHT, WIDTH, FOCAL]) * scale
-        rows.append(np.concatenate((np.stack((-up, right, back, position, size), axis=1).reshape(-1), [2.0, 8.0])))
-    return np.array(rows)
-
-
-def write_llff(folder: Path, rows: np.ndarray) -> None:
-    write_images(folder / "images")
-    np.save(folder / "poses_bounds.npy", rows)
 
 
 @pytest.mark.parametrize("scale", [1.0, 4.0])
@@ -40,7 +23,7 @@ def test_rays_and_depths(scale: float, tmp_path: Path) -> None:
     assert (views.data_format, views.names, views.masks) == ("llff", tuple(NAMES[1:8]), None)
     pixel = torch.tensor([[2, 5, 7]])
     ray = views.cameras.pixel_rays(pixel)
-    x, y = (7.5 - WIDTH / 2) / FOCAL, -(5.5 - HEIGHT / 2) / FOCAL
+    x, y = (7.5 - WIDTH / 2) / FX, -(5.5 - HEIGHT / 2) / FX
     expected = poses()[3][:3, :3] @ (x, y, -1)
     np.testing.assert_allclose(ray.directions[0], expected / np.linalg.norm(expected), atol=1e-12)
     np.testing.assert_allclose(ray.origins[0], poses()[3][:3, 3], atol=1e-12)
@@ -77,6 +60,9 @@ def changed(row: int, column: int, value: float) -> Callable[[np.ndarray], np.nd
         (changed(3, 0, 0.9), r"\[3\]: its pose is no rotation"),
         (changed(2, 14, 0.0), r"\[2\]: its height, width or focal length"),
         (changed(1, 15, 9.0), r"\[1\]: its depths are 9 and 8"),
+        (changed(1, 16, 1e300), r"\[1\]: its depths are 2 and 1e\+300"),
+        (changed(1, 14, 1e300), r"\[1\]: 'view 01.png' .* focal length is 1e\+300"),
+        (changed(1, 3, -1e300), r"\[1\]: 'view 01.png' has its camera at -1e\+300"),
         (changed(0, 4, 99.0), r"view 00.png' is 48 x 36 pixels, its camera's images 48 x 99"),
     ],
 )

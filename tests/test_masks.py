@@ -182,6 +182,21 @@ def test_the_command_writes_what_readers_find(
     assert before == {path: path.read_bytes() for path in (folder / "masks").iterdir()}
 
 
+def test_masks_of_what_may_not_be_written_to_go_elsewhere(
+    tmp_path: Path, images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, edge_se: Any
+) -> None:
+    found = [image[..., 0] > 127 for image in images[:4]]
+    monkeypatch.setattr("edge_se_sampler.masks.command.segment", lambda *_: found)
+    folder, out = tmp_path / "ring", tmp_path / "elsewhere"
+    write_capture(folder, images[:4])
+    answer = edge_se("masks", "--data", folder, "--out", out, "--output-path", tmp_path / "masks.png")
+    assert answer.code == 0
+    assert f"4 masks in {out / 'masks'}" in answer.out
+    assert f"copy what is in {out} into {folder}" in answer.out
+    assert sorted(path.name for path in folder.iterdir()) == ["images", "transforms.json"]
+    assert sorted(path.name for path in (out / "masks").iterdir()) == [f"{i:02d}.png.png" for i in range(4)]
+
+
 def test_what_has_no_object_gets_no_masks(tmp_path: Path, images: list[np.ndarray], edge_se: Any) -> None:
     rng = np.random.default_rng(1)
     empty = [photograph(np.zeros((SIZE, SIZE), dtype=bool), rng) for _ in images]

@@ -12,7 +12,8 @@ from batches import batch_of, brightness, following
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import STRATEGIES
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, Selector, TrainingStep
-from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, SELECTORS
+from edge_se_sampler.sampling.registry import BOTH, PIXEL_STRATEGIES, PixelStrategy, strategy_names
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 def in_box(indices: torch.Tensor) -> bool:
@@ -100,7 +101,7 @@ class Brightest(Selector):
 
 @pytest.mark.parametrize(("step", "settings"), [(0, {"early": "by-column"}), (500, {"late": "by-column"})])
 def test_a_custom_distribution(step: int, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(DISTRIBUTIONS, "by-column", ByColumn)
+    monkeypatch.setitem(PIXEL_STRATEGIES, "by-column", PixelStrategy(ByColumn, BOTH, ""))
     sampler = following(step, rays=20_000, **settings)
     assert sampler.strategy == "by-column"
     columns = sampler.sample(batch_of())["indices"][:, 2]
@@ -109,7 +110,7 @@ def test_a_custom_distribution(step: int, settings: dict[str, Any], monkeypatch:
 
 
 def test_a_custom_selector(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(SELECTORS, "brightest", Brightest)
+    monkeypatch.setitem(PIXEL_STRATEGIES, "brightest", PixelStrategy(f"{__name__}:Brightest", ("late",), ""))
     scores = []
 
     def score(candidates: dict[str, Any]) -> torch.Tensor:
@@ -120,6 +121,39 @@ def test_a_custom_selector(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.testing.assert_close(brightness(trained), scores[0].sort(descending=True).values[:50])
 
 
-def test_an_unknown_strategy_is_refused() -> None:
-    with pytest.raises(InputError, match="'egde' is none of uniform, precrop, edge, se"):
-        following(early="egde")
+@pytest.mark.parametrize(("phase", "name"), [("early", "egde"), ("early", "se"), ("late", "edge")])
+def test_an_unknown_strategy_or_one_of_the_other_phase_is_refused_in_a_line(phase: Any, name: str) -> None:
+    known = (*strategy_names(phase), *(["auto"] if phase == "early" else []))
+    with pytest.raises(InputError) as refusal:
+        EdgeSEPixelSamplerConfig(**{phase: name}).setup()  # pyright: ignore[reportArgumentType]
+    assert str(refusal.value) == f"--pixel-sampler.{phase}: {name!r} is none of {', '.join(known)}"
+
+
+class NoPart:
+    """What another package may take for a strategy."""
+
+    def __init__(self, settings: Any) -> None: ...
+
+
+def test_what_is_no_strategy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PIXEL_STRATEGIES, "typo", PixelStrategy("edge_se_sampler:EdgePixels", BOTH, ""))
+    with pytest.raises(InputError, match=r"edge_se_sampler:EdgePixels cannot be imported: .* no attribute"):
+        following(late="typo")
+    monkeypatch.setitem(PIXEL_STRATEGIES, "number", PixelStrategy(NoPart, BOTH, ""))
+    with pytest.raises(InputError, match="'number': NoPart is no Distribution and no Selector"):
+        following(late="number")
+
+
+def test_what_a_strategy_refuses_and_settings_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals = (("images_per_step", ("all",), "compares images"),)
+    strategy = PixelStrategy(ByColumn, BOTH, "", ("edge_epsilon",), refusals)
+    monkeypatch.setitem(PIXEL_STRATEGIES, "by-column", strategy)
+    following(early="by-column", images_per_step="all", edge_epsilon=0.02)
+    following(images_per_step="one")
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"late": "by-column"}, "images-per-step is 'one': compares images"),
+        ({"edge_epsilon": 0.02}, "edge-epsilon is 0.02: has no effect without early or late by-column"),
+    ]
+    for settings, problem in refused:
+        with pytest.raises(InputError, match=problem):
+            following(**settings)

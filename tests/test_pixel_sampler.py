@@ -17,8 +17,9 @@ from edge_se_sampler.sampling.distribution import PixelTable
 from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, PixelStrategy
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-from edge_se_sampler.sampling.strategies import DISTRIBUTIONS, Edge
+from edge_se_sampler.sampling.strategies import Edge
 
 PHASES = {
     "uniform": {"step": 0, "early": "uniform"},
@@ -253,7 +254,7 @@ def test_an_images_strength_is_computed_once(monkeypatch: pytest.MonkeyPatch) ->
             computed.append(image.tobytes())
             return super().strength(image, background_color)
 
-    monkeypatch.setitem(DISTRIBUTIONS, "edge", CountingEdge)
+    monkeypatch.setitem(PIXEL_STRATEGIES, "edge", PixelStrategy(CountingEdge, ("early",), ""))
     sampler = following()
     for subset in ([1, 2], [2, 3], [3, 1], [2]):
         sampler.sample(batch_of([(9, 14)] * len(subset), subset))

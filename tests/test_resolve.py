@@ -72,7 +72,7 @@ def test_nothing_is_left_open(size: Any) -> None:
 
     assert left_open(resolved) == [
         *("device_type", "data", "data_format", "eval_every", "num_views", "views"),  # a folder decides two of these
-        *("time_budget", "segments", "max_seconds"),
+        *("new_num_iterations", "time_budget", "segments", "max_seconds", "patience"),
     ]
     assert (
         resolve_config(resolved, of_size(800, 800)) == resolved

@@ -19,8 +19,8 @@ from edge_se_sampler.engine.show import probability_map, show
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.image_batch import ImageBatch
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-from edge_se_sampler.sampling.strategies import DISTRIBUTIONS
 
 HEIGHT, WIDTH = 16, 12
 MASKS = tuple(np.random.default_rng(i).random((HEIGHT, WIDTH)) < share for i, share in enumerate((0.5, 0.1, 0.0)))
@@ -28,7 +28,7 @@ STRATEGIES = ("uniform", "precrop", "edge")
 
 
 def probability(views: Views, strategy: str, k: int) -> np.ndarray:
-    distribution = DISTRIBUTIONS[strategy](EdgeSEPixelSamplerConfig())
+    distribution = PIXEL_STRATEGIES[strategy].load()(EdgeSEPixelSamplerConfig())
     return probability_map(distribution, ImageBatch.of(image_batch(views), use_mask=True), k)
 
 

@@ -21,6 +21,7 @@ from blender_folder import chunk, png
 from capture_folder import NAMES, write_colmap, write_images, write_transforms
 from strangers import change_config, change_state, contents, memory_bound, replace_payload
 
+from edge_se_sampler.bench.runner import write_result
 from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint
 
 BOUND = 2**30
@@ -291,7 +292,7 @@ RESULTS: dict[str, Callable[[dict], object]] = {
 def test_a_result_that_would_be_more_than_text(attack: str, tmp_path: Path, refused: Callable) -> None:
     result = json.loads((CONFIGS / "lean-ten-seeds" / "result.json").read_text())
     RESULTS[attack](result)
-    (tmp_path / "result.json").write_text(json.dumps(result))
+    write_result(tmp_path / "result.json", result)
     refused("bench", "report", tmp_path)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from edge_se_sampler.bench.report import write_report
-from edge_se_sampler.bench.runner import Experiment, executor_factory, list_trials, run_experiment
+from edge_se_sampler.bench.runner import ALL, Experiment, Shard, executor_factory, list_trials, run_experiment
 from edge_se_sampler.bench.statistics import require_scipy_stats
 from edge_se_sampler.engine.figures import require_pyplot
 from edge_se_sampler.errors import check_value
@@ -31,6 +31,9 @@ class ExperimentCommand(ABC):
     scheduler: str | None = None
     """Address of a dask scheduler whose workers train ([cluster] extra), instead of --workers; start those with
     one thread each, for CPU seconds are a process's."""
+    shard: str | None = None
+    """Train only a share of the trainings, as 2/8 does the second of eight, for job arrays: its result goes to
+    OUTPUT_DIR/shards. The same command without it takes over what is there, trains the rest, and reports."""
     dry_run: tyro.conf.UseCounterAction[int] = 0
     """Only list the trainings and how many are pending; trains nothing, writes nothing."""
 
@@ -42,15 +45,19 @@ class ExperimentCommand(ABC):
         """Train and report; InputError as `experiment`, `run_experiment` and `write_report`."""
         check_value("seeds", "empty", bool(self.seeds), "at least one number")
         check_value("workers", self.workers, self.workers is None or self.workers > 0, "at least 1")
-        experiment = self.experiment()
+        experiment, shard = self.experiment(), Shard.parse(self.shard)
         if self.dry_run:
-            list_trials(experiment, self.output_dir)
+            list_trials(experiment, self.output_dir, shard)
             return
         require_pyplot()
         require_scipy_stats()
         new_executor = executor_factory(self.workers or self.default_workers(), self.scheduler)
-        run_experiment(experiment, self.output_dir, new_executor)
-        write_report(self.output_dir, workplace=self.workplace)
+        result = run_experiment(experiment, self.output_dir, new_executor, shard)
+        page = shard.path(self.output_dir)
+        if shard == ALL:
+            write_report(self.output_dir, workplace=self.workplace)
+            page = self.output_dir / "README.md"
+        print(f"{len(result['runs'])} trainings; see {page}")
 
     def default_workers(self) -> int:
         """How many trainings at once if --workers is left out: as many as CPUs that this process may use; a GPU is one

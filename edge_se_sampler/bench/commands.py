@@ -16,6 +16,7 @@ from edge_se_sampler.bench.real.command import BenchReal
 from edge_se_sampler.bench.report import write_report
 from edge_se_sampler.bench.schedule.command import BenchSchedule
 from edge_se_sampler.bench.stability.command import BenchStability
+from edge_se_sampler.bench.strategies.command import BenchStrategies
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ BENCHES: dict[str, type] = {
     "schedule": BenchSchedule,
     "chart": BenchChart,
     "real": BenchReal,
+    "strategies": BenchStrategies,
     "baselines": BenchBaselines,
     "report": BenchReport,
 }

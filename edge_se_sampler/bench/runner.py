@@ -18,17 +18,18 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.machine import machine
 from edge_se_sampler.data.scene_file import quote, read_json
-from edge_se_sampler.engine.files import make_folder, write_atomically
+from edge_se_sampler.engine.files import checksum, make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, check_value
 
-VERSION = 2
+VERSION = 3
+"""Of results. Version 2, which is read as well, has no checksum."""
 PLAIN = re.compile(r"[\w .,:;=+/()%'\"~@-]*")
 """Texts without marks of Markdown and HTML."""
 MAX_BROKEN_POOLS = 3
@@ -55,30 +56,77 @@ class Experiment:
     """Trial -> further arguments of `train`, for instance the scene's folder; called in this process."""
 
 
-def list_trials(experiment: Experiment, output_dir: Path) -> None:
-    """Print the trials that are known yet, and how many of them are pending."""
-    result = load_or_create(output_dir / "result.json", experiment.name, experiment.settings)
-    trials = experiment.trials(result["runs"])
+@dataclass(frozen=True)
+class Shard:
+    """A share of an experiment's trials: every count-th from the number-th (1 .. count) on. Its result is a file in
+    OUTPUT_DIR/shards; every call of the command takes over what is there."""
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def parse(cls, text: str | None) -> Shard:
+        """From "2/8"; None: all trials. InputError if it is neither."""
+        match = re.fullmatch(r"(\d+)/(\d+)", text or "1/1")
+        shard = cls(*map(int, match.groups())) if match else cls(0)
+        check_value(
+            "shard", text, 1 <= shard.number <= shard.count, "NUMBER/COUNT, as 2/8, with NUMBER from 1 to COUNT"
+        )
+        return shard
+
+    def of(self, trials: Sequence[Any]) -> Sequence[Any]:
+        return trials[self.number - 1 :: self.count]
+
+    def path(self, output_dir: Path) -> Path:
+        """Of its result."""
+        shards = output_dir / "shards"
+        return output_dir / "result.json" if self.count == 1 else shards / f"{self.number}-of-{self.count}.json"
+
+
+ALL = Shard()
+
+
+def list_trials(experiment: Experiment, output_dir: Path, shard: Shard = ALL) -> None:
+    """Print the trials of a shard that are known yet, and how many of them are pending."""
+    result, _ = _load_with_shards(experiment, output_dir)
+    trials = shard.of(experiment.trials(result["runs"]))
     for trial in trials:
         print(*asdict(trial).values(), sep=" | ")
     print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
 
 
-def run_experiment(experiment: Experiment, output_dir: Path, new_executor: ExecutorFactory) -> dict[str, Any]:
-    """Train every pending trial; result.json is written after each. InputError if the folder cannot be written, or
-    holds a result of other settings."""
-    path = output_dir / "result.json"
-    result = load_or_create(path, experiment.name, experiment.settings)
-    trials = experiment.trials(result["runs"])
-    make_folder(output_dir, "--output-dir")
+def run_experiment(
+    experiment: Experiment, output_dir: Path, new_executor: ExecutorFactory, shard: Shard = ALL
+) -> dict[str, Any]:
+    """Train every pending trial of a shard; its result is written after each. InputError if the folder cannot be
+    written, or holds a result of other settings."""
+    path = shard.path(output_dir)
+    result, is_new = _load_with_shards(experiment, output_dir)
+    trials = shard.of(experiment.trials(result["runs"]))
+    make_folder(path.parent, "--output-dir")
     result["errors"] = []
+    if is_new:
+        write_result(path, result)
     while pending(trials, result):
         _run_trials(experiment, trials, result, path, new_executor)
-        trials = experiment.trials(result["runs"])
+        trials = shard.of(experiment.trials(result["runs"]))
     for error in result["errors"]:
         print(*error.values(), sep=", ")
-    print(f"{len(result['runs'])} trainings; see {output_dir / 'README.md'}")
     return result
+
+
+def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[str, Any], bool]:
+    """An experiment's result with the runs that only shards have, and whether there are any. InputError as
+    `load_or_create`."""
+    result = load_or_create(output_dir / "result.json", experiment.name, experiment.settings)
+    before = len(result["runs"])
+    for path in sorted((output_dir / "shards").glob("*.json")):
+        shard = load_or_create(path, experiment.name, experiment.settings)
+        names = [field.name for field in fields(experiment.trials(result["runs"])[0])]
+        runs = {tuple(run[name] for name in names): run for run in [*shard["runs"], *result["runs"]]}
+        result["runs"] = [runs[key] for key in sorted(runs)]
+        result["command"] = "\n".join(dict.fromkeys([*shard["command"].splitlines(), *result["command"].splitlines()]))
+    return result, len(result["runs"]) > before
 
 
 def load_or_create(path: Path, experiment: str, settings: Any) -> dict[str, Any]:
@@ -105,17 +153,21 @@ def _command() -> str:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A result.json; InputError if it cannot be read, or is no result of this version."""
+    """A result.json; InputError if it cannot be read, is no result of this version or the one before, or is not as it
+    was written."""
     result = read_json(path).object()
+    claimed = result.pop("checksum", None)
     try:
-        if result["version"] != VERSION:
+        if result["version"] not in (2, VERSION):
             raise ValueError(f"version {result['version']}, not {VERSION}")
+        if claimed != (None if result["version"] == 2 else checksum(result)):
+            raise ValueError("changed since it was written (checksum)")
         if not {"experiment", "command", "settings", "machine"} <= result.keys():
             raise KeyError("experiment, command, settings or machine")
         if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
             raise TypeError("runs and errors are lists of objects")
         check_texts(result)
-    except (ValueError, KeyError, TypeError) as problem:
+    except (ValueError, KeyError, TypeError, RecursionError) as problem:
         raise InputError(f"{path}: not a result of edge-se bench ({quote(problem)})") from problem
     return result
 
@@ -140,7 +192,9 @@ def check_plain(value: Any) -> None:
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
     """result.json, every run on a line of its own; InputError if it cannot be written."""
-    head = json.dumps({key: value for key, value in result.items() if key != "runs"}, indent=1, allow_nan=False)
+    result = {**result, "version": VERSION}
+    head = {key: value for key, value in result.items() if key != "runs"} | {"checksum": checksum(result)}
+    head = json.dumps(head, indent=1, allow_nan=False)
     runs = ",\n".join(json.dumps(run, allow_nan=False) for run in result["runs"])
     write_atomically(path, f'{head[:-2]},\n "runs": [\n{runs}\n ]\n}}\n'.encode())
 

@@ -29,8 +29,12 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
     words = [f"{key}-{value}" for key, value in sorted(options.items())]
     folder = workplace / "scenes" / ("_".join(words) or "default")
     if not (folder / name).exists():
-        with Progress(0, f"rendering {name}") as progress:
-            make_scenes(folder, [name], progress=progress.update, **options)
+        try:
+            with Progress(0, f"rendering {name}") as progress:
+                make_scenes(folder, [name], progress=progress.update, **options)
+        except OSError:
+            if not (folder / name).exists():  # another shard has rendered it meanwhile
+                raise
     return folder / name
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar, get_args
@@ -9,7 +11,7 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 
 from edge_se_sampler.data.frames import Frame
-from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, quote
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -41,11 +43,12 @@ def keep_existing(
     items: Sequence[Item], images: Sequence[SourceFile], listing: SourceLocation
 ) -> tuple[list[Item], str]:
     """The items whose images exist, and a line about the others; InputError if fewer than half of them do."""
-    kept = [item for item, image in zip(items, images, strict=True) if image.path.exists()]
+    exist = [os.path.exists(image.path) for image in images]  # Path.exists() raises where a name is too long
+    kept = list(itertools.compress(items, exist))
     if len(kept) == len(items):
         return kept, ""
-    first = next(image for image in images if not image.path.exists())
-    found = f"{len(items) - len(kept)} of the {len(items)} listed images do not exist, {first.name!r} for one"
+    first = images[exist.index(False)]
+    found = f"{len(items) - len(kept)} of the {len(items)} listed images do not exist, {quote(first.name)} for one"
     if 2 * len(kept) < len(items):
         raise listing.error(found, "put them there, or list only what is there")
     return kept, f"{listing.file}: {found}: left out"

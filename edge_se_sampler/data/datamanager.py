@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from edge_se_sampler import ranks
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.config import VanillaDataManagerConfig
 from edge_se_sampler.data.views import Views
@@ -53,9 +54,10 @@ class VanillaDataManager:
         return self.cameras.pixel_rays(batch["indices"]), batch
 
     def observe(self, squared_error: Tensor) -> None:
-        """Tell the sampler the (N,) squared errors that training found on the last batch."""
-        if isinstance(self.train_pixel_sampler, ImportantPixels):
-            self.train_pixel_sampler.observe(squared_error)
+        """Tell the sampler the (N,) squared errors that training found on the last batch, 0 for other ranks' rays."""
+        sampler = self.train_pixel_sampler
+        if isinstance(sampler, ImportantPixels) and sampler.pending_batch is not None:
+            sampler.observe(ranks.add_up(squared_error))
 
     def state_dict(self) -> dict[str, Any]:
         """The pixel sampler's state, for a checkpoint; nothing for a host's sampler that has none."""
@@ -89,11 +91,15 @@ class VanillaDataManager:
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:
         """(n,) squared errors of the model's fine colors, or of its coarse ones if so configured, in training mode."""
         image = unit_interval(batch["image"]).to(self.device)
-        chunks = list(model.chunks(len(ray_bundle)))
         settings = self.train_pixel_sampler.config
-        if isinstance(settings, SamplingSettings) and settings.error_source == "coarse":
-            return torch.cat([model.coarse_squared_error(ray_bundle[rows], image[rows]) for rows in chunks])
-        return torch.cat([model.squared_error(model(ray_bundle[rows]), image[rows]) for rows in chunks])
+        coarse = isinstance(settings, SamplingSettings) and settings.error_source == "coarse"
+        errors = torch.zeros(len(ray_bundle), dtype=model.dtype, device=self.device)
+        for rows in model.own_chunks(len(ray_bundle)):
+            rays, pixels = ray_bundle[rows], image[rows]
+            errors[rows] = (
+                model.coarse_squared_error(rays, pixels) if coarse else model.squared_error(model(rays), pixels)
+            )
+        return ranks.add_up(errors)
 
 
 def random_rays(cameras: Cameras, camera_indices: np.ndarray, rng: np.random.Generator) -> RayBundle:

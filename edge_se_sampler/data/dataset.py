@@ -14,6 +14,7 @@ from edge_se_sampler.data.colmap_model import find_model
 from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
+from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.scene_file import SourceLocation, check_folder
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.data.views import Views
@@ -38,6 +39,8 @@ class DataSettings:
     masks: Masks = "ignore"
     eval_every: int | None = None
     downscale: int = 1
+    model_memory: ModelMemory = lambda longest: 0
+    """What training takes of memory beside the images."""
 
 
 def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
@@ -73,7 +76,7 @@ def read_split(
         "eval-every", settings.eval_every, settings.eval_every is None or settings.eval_every >= 2, "at least 2"
     )
     data_format = find_format(folder, settings.data_format)
-    load = LoadSettings(settings.masks, settings.downscale)
+    load = LoadSettings(settings.masks, settings.downscale, settings.model_memory)
     if data_format == "blender":
         _check_unsplit(settings, has_own_split=True)
         if split != "train" and not has_split(folder, split):

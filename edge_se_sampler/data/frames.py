@@ -17,7 +17,7 @@ from edge_se_sampler.data.config import Masks
 from edge_se_sampler.data.downscale import average_pixels, shrink_mask
 from edge_se_sampler.data.image_file import ImageHeader, read_header, read_image, turn_upright
 from edge_se_sampler.data.lens import Intrinsics, find_pinhole, find_sources, undistort
-from edge_se_sampler.data.memory import check_memory, num_workers
+from edge_se_sampler.data.memory import ModelMemory, check_memory, num_workers
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
@@ -28,6 +28,13 @@ MAX_MISFIT = 2**22
 """Pixels of a mask of another size than its image, up to which it is decoded: it may be damaged, too."""
 MAX_REMAPPED = 2**15 - 2
 """Pixels, of a side: OpenCV undistorts no larger images."""
+MIN_FOCAL, MAX_FOCAL = 0.01, 1e4
+"""Focal lengths of cameras, in longer sides of their images: fields of view of 178 degrees, and of 20 arc seconds."""
+MAX_OFFSET = 100.0
+"""Of a principal point from the center, in the larger of the image's longer side and the focal length."""
+MAX_POSITION, MAX_REMOVAL = 1e15, 1e5
+"""Coordinates of a camera, world units; and how far all are from the origin, in their distances from each other, beyond
+which numbers of 32 bits cannot tell them apart."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,8 @@ class LoadSettings:
     """What a mask file means: pixels outside are unknown and ignored, or not of the object, which is alpha."""
     downscale: int = 1
     """Every so many pixels along both axes become one."""
+    model_memory: ModelMemory = lambda longest: 0
+    """What training takes of memory beside them."""
 
 
 def read_headers(files: Sequence[SourceFile]) -> list[ImageHeader]:
@@ -81,6 +90,31 @@ def choose_orientation(file: SourceFile, header: ImageHeader, matches: Callable[
     raise file.error(problem, "turn the pixels themselves, or remove the tag if the camera is that of the stored ones")
 
 
+def check_cameras(frames: Sequence[Frame]) -> None:
+    """InputError for cameras that cannot have taken the images of at least one frame, or too far from the origin."""
+    for frame in frames:
+        width, height, camera = frame.header.width, frame.header.height, frame.camera
+        longest = max(width, height)
+        for focal in (camera.fx, camera.fy):
+            if not MIN_FOCAL * longest <= focal <= MAX_FOCAL * longest:
+                problem = f"is of {width} x {height} pixels, and its camera's focal length is {focal:g}"
+                raise frame.image.error(problem, "write the focal length in pixels")
+        offset = max(abs(camera.cx - width / 2), abs(camera.cy - height / 2))
+        if not offset <= MAX_OFFSET * max(longest, camera.fx, camera.fy):
+            problem = f"has its camera's principal point at {camera.cx:g}, {camera.cy:g}, far outside of it"
+            raise frame.image.error(problem, "write the principal point in pixels from the upper left corner")
+        if not np.abs(frame.pose[:, 3]).max() <= MAX_POSITION:
+            problem = f"has its camera at {', '.join(f'{x:g}' for x in frame.pose[:, 3])}"
+            raise frame.image.error(problem, f"write coordinates of at most {MAX_POSITION:g}")
+    positions = np.array([frame.pose[:, 3] for frame in frames])
+    center = np.median(positions, axis=0)
+    spread, removal = np.linalg.norm(positions - center, axis=1).max(), np.linalg.norm(center)
+    if spread > 0 and removal > MAX_REMOVAL * spread:
+        problem = f"its cameras are {removal:.3g} from the origin, but only {spread:.3g} from each other"
+        remedy = "subtract the same position from all poses, so that the origin is among them"
+        raise SourceLocation(frames[0].image.location.file).error(problem, remedy)
+
+
 def load_views(
     frames: Sequence[Frame],
     settings: LoadSettings = LoadSettings(),
@@ -89,9 +123,10 @@ def load_views(
     """Decode the images of at least one frame. InputError for images and masks that cannot be used, for a mask of
     another size, and where they would not fit the machine's memory."""
     listing = SourceLocation(frames[0].image.location.file)
+    check_cameras(frames)
     for frame in frames:
         _check_size(frame, settings.downscale)
-    check_memory(_sizes(frames), settings.downscale, listing)
+    memory = check_memory(_sizes(frames), settings.downscale, settings.model_memory, listing)
     largest = max(frame.header.width * frame.header.height for frame in frames)
     images, masks = [], []
     with ThreadPoolExecutor(num_workers(largest)) as pool:  # decoders and numpy release Python's lock
@@ -99,6 +134,7 @@ def load_views(
             images.append(image)
             masks.append(mask)
             progress(len(images), len(frames))
+    find_sources.cache_clear()
     if settings.masks == "object" and all(image.shape[2] == 3 for image in images):
         raise listing.error("has neither masks nor alpha for --masks object", "add masks, or leave the flag out")
     has_masks = any(mask is not None for mask in masks)
@@ -109,7 +145,8 @@ def load_views(
             frames_field = replace(location, field=location.field.partition("[")[0])
             raise frames_field.error("all pixels of all views are masked", "masks are non-zero where to train")
     names = tuple(frame.name for frame in frames)
-    return Views(names, tuple(images), tuple(masks) if has_masks else None, _cameras(frames, settings.downscale))
+    cameras = _cameras(frames, settings.downscale)
+    return Views(names, tuple(images), tuple(masks) if has_masks else None, cameras, memory=memory)
 
 
 def _sizes(frames: Sequence[Frame]) -> np.ndarray:
@@ -153,13 +190,17 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 
 
 def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: the largest color of the mask's pixels; it is turned as its image was."""
-    (height, width), header = image.shape[:2], read_header(file)
+    """(H, W) uint8: the largest color of the pixels of an image's mask, which is turned as its own orientation says if
+    that gives it the image's size."""
+    height, width = size = image.shape[:2]
+    header = choose_orientation(
+        file, read_header(file), lambda header: (header.width, header.height) == (width, height)
+    )
     found = header.height, header.width
-    if found == (height, width) or header.height * header.width <= MAX_MISFIT:
-        colors = read_image(file)[..., :3]  # without alpha: an opaque black mask still masks
+    if found == size or header.height * header.width <= MAX_MISFIT:
+        colors = turn_upright(read_image(file), header.orientation)[..., :3]  # without alpha: an opaque black one masks
         found = colors.shape[:2]
-        if found == (height, width):
+        if found == size:
             return colors.max(axis=2)
     problem = f"is {found[1]} x {found[0]} pixels, its image {width} x {height}"
     raise file.error(problem, "give the mask the size of its image")

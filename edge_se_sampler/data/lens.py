@@ -80,6 +80,7 @@ def _all_inside(camera: Intrinsics, pinhole: Intrinsics, width: int, height: int
     return bool(locate(camera, pinhole, width, height, x[None], y[None])[1].all())
 
 
+@lru_cache(maxsize=1)  # most captures have one camera
 def find_sources(camera: Intrinsics, pinhole: Intrinsics, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Where the image of a camera with a lens shows what a pinhole shows at each pixel; both images are of that size.
 

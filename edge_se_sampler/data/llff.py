@@ -14,7 +14,7 @@ import numpy as np
 
 from edge_se_sampler.data.capture import Capture
 from edge_se_sampler.data.colmap import ROUNDING, find_images
-from edge_se_sampler.data.frames import Frame, choose_orientation, read_headers
+from edge_se_sampler.data.frames import MAX_POSITION, Frame, choose_orientation, read_headers
 from edge_se_sampler.data.image_file import ImageHeader
 from edge_se_sampler.data.lens import Intrinsics
 from edge_se_sampler.data.mask_files import find_mask
@@ -50,7 +50,7 @@ def _read_rows(path: Path) -> np.ndarray:
     data = SourceFile(path, location).read_bytes()
     try:
         rows = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False).astype(np.float64, casting="safe")
-    except Exception:  # ValueError, TypeError, TokenError, RecursionError, ...: a header is Python text
+    except Exception:  # numpy raises ValueError, TypeError, MemoryError, tokenize.TokenError, ... on bad files
         raise location.error(
             "is not a file of numbers as numpy saves them", "write it again with LLFF's tools"
         ) from None
@@ -71,7 +71,7 @@ def _check_row(row: np.ndarray, location: SourceLocation) -> None:
         raise location.error("its pose is no rotation", hint)
     if (matrix[:, 4] <= 0).any():
         raise location.error("its height, width or focal length is not above 0", hint)
-    if not 0 < near < far:
+    if not 0 < near < far <= MAX_POSITION:
         raise location.error(f"its depths are {near:g} and {far:g}, not 0 < near < far", hint)
 
 

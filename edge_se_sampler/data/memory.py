@@ -1,10 +1,12 @@
-"""Whether the images of a scene, and what training keeps of their pixels, fit the machine's memory: estimated before
-any is decoded."""
+"""Whether the images of a scene, what training keeps of their pixels, and its model fit the machine's memory: estimated
+before any image is decoded."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +20,37 @@ BYTES_OF_TABLES = 20
 BYTES_AT_WORK = 60
 """Of a pixel of an image that is undistorted and averaged, at most: colors and where they come from, in float32."""
 MEMORY_AT_WORK = 3 * 2**29
-"""Bytes of all images that are decoded at the same time."""
+"""Bytes of all images that are decoded at the same time, at most; and half of what is available."""
+MIN_SIDE = 50
+"""Pixels of the shorter side of the images that are still worth training on."""
+ModelMemory = Callable[[int], int]
+"""The longest side of the images, in pixels -> bytes that training a model takes beside them."""
+
+
+@dataclass(frozen=True)
+class MemoryNeeds:
+    """Bytes that training takes at most."""
+
+    images: int
+    tables: int
+    """What pixel samplers keep of each pixel."""
+    model: int
+    """0: it is in a memory of its own, or there is none."""
+
+    @property
+    def total(self) -> int:
+        return self.images + self.tables + self.model
+
+    def __str__(self) -> str:
+        parts = [f"images {_format(self.images)}", f"tables {_format(self.tables)}"]
+        return ", ".join(parts + [f"model up to {_format(self.model)}"] * (self.model > 0))
 
 
 def num_workers(num_pixels: int) -> int:
     """How many images of at most so many pixels are decoded at the same time."""
-    return max(1, min(os.cpu_count() or 1, MEMORY_AT_WORK // (BYTES_AT_WORK * num_pixels)))
+    available = available_memory()
+    at_work = MEMORY_AT_WORK if available is None else min(MEMORY_AT_WORK, available // 2)
+    return max(1, min(os.cpu_count() or 1, at_work // (BYTES_AT_WORK * num_pixels)))
 
 
 def available_memory() -> int | None:
@@ -57,19 +84,36 @@ def _physical_memory() -> int | None:
         return None
 
 
-def check_memory(sizes: np.ndarray, downscale: int, location: SourceLocation) -> None:
-    """InputError, which says what to give, if training on images of these sizes takes more than what is available.
-    `sizes` (n, 3) int64: width, height, bytes of a pixel; `location` is the file that lists them."""
-    available = available_memory()
-    if available is None or (needed := _count_bytes(sizes, downscale)) <= available:
-        return
-    enough = downscale + 1
-    while _count_bytes(sizes, enough) > available:
-        enough += 1
-    problem = f"its {len(sizes)} images take {needed / 2**30:.1f} GiB of memory, {available / 2**30:.1f} are available"
-    raise location.error(problem, f"give --downscale {enough}")
+def check_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, location: SourceLocation) -> str:
+    """What training on images of these sizes takes, and what is available, in a line; InputError, which says what to
+    give, if that is less. `sizes` (n, 3) int64: width, height, bytes of a pixel; `location` is the file that lists
+    them."""
+    needed, available = estimate_memory(sizes, downscale, model_memory), available_memory()
+    if available is None:
+        return str(needed)
+    if needed.total <= available:
+        return f"{needed}; {_format(available)} available"
+    problem = f"training on its {len(sizes)} images takes {_format(needed.total)} of memory ({needed})"
+    remedy = _find_remedy(sizes, downscale, model_memory, available)
+    raise location.error(f"{problem}, {_format(available)} are available", remedy)
 
 
-def _count_bytes(sizes: np.ndarray, downscale: int) -> int:
-    pixels = sizes[:, 0] // downscale * (sizes[:, 1] // downscale)
-    return int((pixels * (COPIES * sizes[:, 2] + BYTES_OF_TABLES)).sum())
+def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory) -> MemoryNeeds:
+    """What training on images of these sizes takes, as `check_memory` has them."""
+    width, height = sizes[:, 0] // downscale, sizes[:, 1] // downscale
+    pixels = width * height
+    images, tables = COPIES * int((pixels * sizes[:, 2]).sum()), BYTES_OF_TABLES * int(pixels.sum())
+    return MemoryNeeds(images, tables, model_memory(int(max(width.max(), height.max()))))
+
+
+def _find_remedy(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, available: int) -> str:
+    for enough in range(downscale + 1, int(sizes[:, :2].min()) // MIN_SIDE + 1):
+        if estimate_memory(sizes, enough, model_memory).total <= available:
+            return f"give --downscale {enough}"
+    largest = estimate_memory(sizes, downscale, model_memory)
+    return "give fewer images" if largest.model <= available else "train a smaller model"
+
+
+def _format(size: int) -> str:
+    gib = min(size, 2**100) / 2**30
+    return f"{gib:,.1f} GiB" if gib >= 0.1 else f"{1024 * gib:.1f} MiB"

@@ -90,9 +90,10 @@ def check_folder(folder: Path) -> None:
 
 
 def locate_file(folder: Path, listed: str, location: SourceLocation) -> SourceFile:
-    """The file that is listed, relative to `folder`; InputError if that lies outside it, be it through a link."""
+    """The file that is listed, relative to `folder`; InputError if that lies outside it, be it through a link, or if no
+    file can have that name."""
     if "\0" in listed:
-        raise location.error(f"{quote(listed)} has a zero byte", "write the name of a file")
+        raise location.error(f"has characters that no file name can have: {quote(listed)}", "name an image's file")
     if os.path.isabs(listed):
         raise location.error(f"{quote(listed)} is an absolute path", "write it relative to the folder")
     file = SourceFile(Path(os.path.realpath(folder / listed)), location, listed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,12 @@ class Views:
     depths: tuple[float, float] | None = NERF_SYNTHETIC_DEPTHS  # near and far by the format; None: it has none
     data_format: str | None = None  # None: made in memory
     eval_every: int | None = None  # every how many images one is held out; None: the data has a split
+    memory: str = ""  # what training on them takes of memory, as estimated before they were read; "": it was not
+
+    @property
+    def longest_side(self) -> int:
+        """Of all images, in pixels."""
+        return max(max(image.shape[:2]) for image in self.images)
 
     def subset(self, indices: Sequence[int]) -> Views:
         """The views of these indices, in this order."""
@@ -38,6 +45,16 @@ class Views:
         if self.masks is not None:
             masks = [mask & own for mask, own in zip(masks, self.masks, strict=True)]
         return replace(self, masks=tuple(masks))
+
+    def digest(self) -> str:
+        """A hash of images, masks and cameras, the latter as single precision holds them."""
+        digest = hashlib.sha256()
+        for array in (*self.images, *(self.masks or ())):
+            digest.update(f"{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).data)
+        for values in vars(self.cameras).values():
+            digest.update(values.float().numpy().tobytes())
+        return digest.hexdigest()
 
     def describe(self) -> str:
         """How many views of which sizes there are, and what their alpha and masks mean, in a line."""

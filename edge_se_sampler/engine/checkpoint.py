@@ -1,14 +1,15 @@
-"""Checkpoints that are written completely or not at all.
+"""Checkpoints that are written completely or not at all, the newest and the one before.
 
-A file is one line of text, "edge-se-checkpoint 2 <sha256 of the rest>", followed by torch.save's bytes. It is
-written to a temporary file, flushed to the disk and renamed: a process killed at any moment leaves the old file or the
-new one. It is loaded with weights_only=True: a pickle in it is refused, never run.
+A file is one line of text, "edge-se-checkpoint 3 <sha256 of the line so far and of the rest>", followed by torch.save's
+bytes. It is written to a temporary file, flushed to the disk and renamed: a process killed at any moment leaves the old
+file or the new one. It is loaded with weights_only=True: a pickle in it is refused, never run.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import sys
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,19 +18,25 @@ import torch
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.engine.saved_state import check_archive, check_tensors
-from edge_se_sampler.errors import InputError
+from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
-MAGIC = b"edge-se-checkpoint 2 "
+MAGIC = b"edge-se-checkpoint 3 "
+MAGIC_2 = b"edge-se-checkpoint 2 "
+"""Of format 2, whose checksum leaves out the line itself."""
 NAMES = f"step-{9 * '[0-9]'}*.ckpt"
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
-    """Write the checkpoint after a step (0, 1, ...), then delete the older ones; InputError if it cannot be written."""
+    """Write the checkpoint after a step (0, 1, ...), and keep the one before beside it; InputError if that fails. Those
+    of later steps are deleted as well: they were damaged, or the steps would not have been trained again."""
     path = folder / f"step-{step:09d}.ckpt"
     write_atomically(path, lambda file: _write(state, file))
-    for other in folder.glob(NAMES):
-        if _step_of(other) < step:
-            other.unlink(missing_ok=True)
+    others = [other for other in folder.glob(NAMES) if other != path]
+    before = max((other for other in others if _step_of(other) < step), key=_step_of, default=None)
+    with os_errors_as_input_errors(f"{folder}: older checkpoints cannot be deleted"):
+        for other in (*others, *folder.glob(".step-*.tmp")):
+            if other != before:
+                other.unlink(missing_ok=True)
     return path
 
 
@@ -38,7 +45,7 @@ class _HashingWriter(io.RawIOBase):
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self.digest = hashlib.sha256()
+        self.digest = hashlib.sha256(MAGIC)
         self.problem: OSError | None = None
 
     def writable(self) -> bool:
@@ -73,14 +80,42 @@ def latest_checkpoint(folder: Path) -> Path:
     return latest
 
 
+class DamagedCheckpoint(InputError):
+    """A checkpoint cannot be read, or is not as it was saved."""
+
+
+def load_latest(folder: Path, config_digest: str) -> tuple[Path, dict[str, Any]]:
+    """The newest checkpoint and its state; if it is damaged, those of the one before, with a line that says so.
+    InputError if all are damaged, or as `load_checkpoint`."""
+    latest_checkpoint(folder)
+    damaged: list[DamagedCheckpoint] = []
+    for path in sorted(folder.glob(NAMES), key=_step_of, reverse=True):
+        try:
+            state = load_checkpoint(path, config_digest)
+        except DamagedCheckpoint as problem:
+            damaged.append(problem)
+            continue
+        if damaged:
+            print(f"edge-se: {damaged[0]}; {path.name}, the one before, takes its place", file=sys.stderr)
+        return path, state
+    raise InputError(f"{damaged[0]}, and no other is whole; restore it or train again")
+
+
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
-    """Read a checkpoint; InputError if it is unreadable, damaged, none, or saved under another configuration."""
-    content = SourceFile(path, SourceLocation(path)).read_bytes()
+    """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle, is none, or
+    was saved under another configuration."""
+    try:
+        content = SourceFile(path, SourceLocation(path)).read_bytes()
+    except InputError as problem:
+        raise DamagedCheckpoint(str(problem)) from problem
     header, _, payload = content.partition(b"\n")
-    if not header.startswith(MAGIC):
-        raise InputError(f"{path}: not a checkpoint of this version of edge-se; use a run folder that it wrote")
-    if header[len(MAGIC) :] != hashlib.sha256(payload).hexdigest().encode():
-        raise InputError(f"{path}: truncated or changed since it was saved (checksum); restore it or train again")
+    magic = header[: len(MAGIC)]
+    if magic not in (MAGIC, MAGIC_2):
+        raise DamagedCheckpoint(f"{path}: not a checkpoint of this version of edge-se")
+    digest = hashlib.sha256(b"" if magic == MAGIC_2 else magic)
+    digest.update(payload)
+    if header[len(MAGIC) :] != digest.hexdigest().encode():
+        raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
     try:
         check_archive(payload)
         state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)

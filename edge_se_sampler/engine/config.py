@@ -20,7 +20,7 @@ from edge_se_sampler.models.config import (
     NeRFModelConfig,
     SizePreset,
 )
-from edge_se_sampler.protocol import InstantiateConfig
+from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,8 @@ class TrainerConfig(InstantiateConfig):
     """Name of the experiment; by default the data folder's name."""
     max_num_iterations: int | None = None
     """Planned iterations, which determine phases and learning rate; by default the model size's."""
+    new_num_iterations: Annotated[int | None, tyro.conf.Suppress] = field(default=None, metadata=ADDED_LATER)
+    """Planned iterations since `edge-se resume --max-num-iterations`, by which the early phase is no longer."""
     time_budget: str | None = None
     """Train for so long (60, 90s, 10m, 1h) in place of a number of iterations: phases and learning rate follow the
     clock (lean-nerf)."""
@@ -96,8 +98,12 @@ class TrainerConfig(InstantiateConfig):
     """Iterations of each hundredth of the training; config.json has those of a run with a time budget, to repeat it."""
     max_seconds: float | None = None
     """Stop after so many seconds, even if iterations are left."""
+    patience: int | None = field(default=None, metadata=ADDED_LATER)
+    """Stop when the validation view's PSNR has not risen by MIN_GAIN for so many previews; by default never."""
+    min_gain: float = field(default=0.1, metadata=ADDED_LATER)
+    """dB by which the PSNR must rise above the best so far for --patience to begin anew."""
     steps_per_save: int = 1000
-    """Iterations between checkpoints; one is saved at the end and on Ctrl-C too."""
+    """Iterations between checkpoints, of which the last two are kept; one is saved at the end and on Ctrl-C too."""
     steps_per_eval_image: int | None = None
     """Iterations between previews of a validation view; by default a tenth of the planned ones."""
     steps_per_log: int = 10
@@ -135,6 +141,7 @@ class TrainerConfig(InstantiateConfig):
         manager, model, optimizer = self.pipeline.datamanager, self.pipeline.model, self.optimizer
         at_least_one = {
             "max-num-iterations": self.max_num_iterations,
+            "patience": self.patience,
             "downscale": self.downscale,
             "steps-per-save": self.steps_per_save,
             "steps-per-eval-image": self.steps_per_eval_image,
@@ -148,6 +155,7 @@ class TrainerConfig(InstantiateConfig):
         check_value(flag, rays, rays <= MAX_RAYS, f"at most {MAX_RAYS}")
         seconds = self.max_seconds
         check_value("max-seconds", seconds, seconds is None or 0 < seconds < INFINITY, "above 0, and finite")
+        check_value("min-gain", self.min_gain, 0 <= self.min_gain < INFINITY, "at least 0, and finite")
         for name in (self.method_name, self.experiment_name):
             if name in ("", ".", "..") or "/" in str(name) or "\0" in str(name):
                 raise InputError(f"{name!r} cannot name a folder: give --experiment-name a plain name")

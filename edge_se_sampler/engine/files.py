@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Callable
@@ -53,6 +54,12 @@ def make_folder(path: Path, flag: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
     if not os.access(path, os.W_OK):
         raise InputError(f"{flag} {path}: cannot be written")
+
+
+def checksum(content: Any) -> str:
+    """SHA-256 of a json value, whatever the order of its keys."""
+    content = json.loads(json.dumps(content))  # keys that are numbers become strings
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def write_json(path: Path, content: Any) -> None:

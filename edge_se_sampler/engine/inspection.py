@@ -11,33 +11,41 @@ from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
+from edge_se_sampler.models.lean import BYTES_PER_ROW, ROWS_PER_PIXEL
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis
 from edge_se_sampler.sampling.edges import unit_float
 
-NUM_VIEWS = 3  # in the picture
+NUM_VIEWS, NUM_AXES = 3, 12
+"""Of the images, and of the cameras' optical axes, in the picture."""
 
 
 def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     """What is derived from training views, one finding a line; draws it too. InputError for bad settings or outputs."""
     pyplot = require_pyplot()
-    config, depth_source = resolve_depths(views, decide_size(config, views.images))
+    config, depth_source = resolve_depths(views, decide_size(config, views.longest_side))
     config.check()
     analysis = analyze_views(views, config)
     hull, hit_pixels = analysis.hull, analysis.hit_pixels
     figure, axes = pyplot.subplots(2, NUM_VIEWS, figsize=(9.6, 6.6))
     ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
     poses = views.cameras.camera_to_worlds.numpy()
-    sampled = poses[:, :, 3] - np.multiply.outer(config.depths, poses[:, :, 2])  # optical axes, from near to far
+    some = poses[:: -(-len(poses) // NUM_AXES)]
+    sampled = some[:, :, 3] - np.multiply.outer(config.depths, some[:, :, 2])  # optical axes, from near to far
     for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
         right, up = (other for other in range(3) if other != along)
         extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
-        axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6, zorder=-2)
-        axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3, zorder=-1)
+        axis.plot(sampled[..., right], sampled[..., up], color="tab:cyan", linewidth=0.6)
+        axis.plot(poses[:, right, 3], poses[:, up, 3], ".", color="tab:green", markersize=3)
         axis.imshow(hull.cells.sum(axis=along).T, origin="lower", extent=extent, cmap="magma", interpolation="nearest")
         axis.set(xlabel="xyz"[right], ylabel="xyz"[up], title=f"cells along {'xyz'[along]}")
         axis.autoscale()
     lines = axes[0, 0].lines
-    figure.legend([lines[-1], lines[0]], ["cameras", "depths at which rays are sampled"], ncols=2, loc="upper center")
+    figure.legend(
+        [lines[-1], lines[0]],
+        ["cameras", "depths at which some cameras' rays are sampled"],
+        ncols=2,
+        loc="upper center",
+    )
     chosen = np.linspace(0, len(views.images) - 1, NUM_VIEWS).round().astype(int).tolist()
     axes[1, 1].set_xlabel("dark: pixels whose rays miss these cells")
     for axis, k in zip(axes[1], chosen, strict=True):
@@ -56,6 +64,7 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
     hull, box, preset, footprint = analysis.hull, analysis.box, config.preset, analysis.box.pixel_footprint
     num_views, num_occupied = len(views.images), hull.cells.sum()
     sizes = " and ".join(f"{width} x {height}" for width, height in sorted({i.shape[1::-1] for i in views.images}))
+    assert config.max_memory is not None  # the config is resolved
     # large cells may reach beyond the box
     num_cells = max(hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3)
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
@@ -64,6 +73,7 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
     return {
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
         "data": views.describe(),
+        "memory": views.memory or "not known of views that were made in memory",
         "depths": f"{config.near:g} to {config.far:g}, by {depth_source}",
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
@@ -72,6 +82,8 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)",
         "levels": f"what training sees is subdivided {analysis.max_level} times, to about {config.voxel_size_px:g} "
         f"pixels, as what was seen and {config.max_memory:.1f} GiB allow",
+        "corners": f"{config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million of cells fit into that; the images "
+        f"show enough to learn {ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million",
         "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
         "longer side",
         "rays": f"{100 * share:.1f} % of the pixels may cross these cells",

@@ -34,6 +34,10 @@ class Pipeline:
     """A RayModel."""
     data_summary: str = ""
     """What the training views are, in a line."""
+    data_digest: str = ""
+    """Of the training views."""
+    memory_summary: str = ""
+    """What training was estimated to take of memory, in a line; "": that is not known."""
     hull: Hull | None = None
     """The cells with which training begins; None: the model has no grid."""
 
@@ -42,7 +46,7 @@ class Pipeline:
         """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own. InputError
         if the checkpoint's grid is another scene's."""
         model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
-        grid, hull, has_masks, summary = saved_grid, None, False, views.describe()
+        grid, hull, has_masks, summary, digest = saved_grid, None, False, views.describe(), views.digest()
         if model_config.needs_grid:
             analysis = analyze_views(views, model_config)
             grid, hull = analysis.grid(), analysis.hull
@@ -57,7 +61,8 @@ class Pipeline:
             manager_config = replace(manager_config, pixel_sampler=manager_config.pixel_sampler.resolve_auto(has_masks))
         background = (model_config.background_level,) * 3  # a random one has no edges of its own: white will do
         datamanager = manager_config.setup(views=views, device=device, background_color=background)
-        return cls(datamanager, build_model(config, device, saved_grid or grid), summary, hull)
+        model = build_model(config, device, saved_grid or grid)
+        return cls(datamanager, model, summary, digest, views.memory, hull)
 
 
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:

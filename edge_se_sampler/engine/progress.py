@@ -10,6 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from edge_se_sampler.ranks import is_main
+
 SECONDS_PER_LINE = 30
 LINE = "{desc}: {n_fmt}/{total_fmt}, {percentage:.0f} %, {remaining} left{postfix}"
 
@@ -20,8 +22,9 @@ class Progress(AbstractContextManager):
 
     def __init__(self, total: int, label: str, start: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         self.total, self.label, self.start, self._clock = total, label, start, clock
-        # disabled where stderr is no terminal
-        self._bar = tqdm(total=total, desc=label, initial=start, leave=False, dynamic_ncols=True, disable=None)
+        # None: disabled where stderr is no terminal
+        disable = None if is_main() else True
+        self._bar = tqdm(total=total, desc=label, initial=start, leave=False, dynamic_ncols=True, disable=disable)
         self._began = self._last_line = self._last_update = clock()
 
     def update(self, done: int, total: int | None = None, note: str = "") -> None:
@@ -33,7 +36,7 @@ class Progress(AbstractContextManager):
             return
         now = self._clock()
         next_update, self._last_update = now + (now - self._last_update), now
-        if self.total and next_update - self._last_line > SECONDS_PER_LINE:
+        if is_main() and self.total and next_update - self._last_line > SECONDS_PER_LINE:
             self._last_line = now
             shown = {"prefix": self.label, "postfix": note, "initial": self.start, "bar_format": LINE}
             print(tqdm.format_meter(done, self.total, now - self._began, **shown), file=sys.stderr, flush=True)

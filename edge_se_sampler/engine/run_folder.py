@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import itertools
 import json
 import os
+import shutil
+import sys
 import time
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -19,8 +21,12 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from edge_se_sampler.data.scene_file import SourceLocation, locate_file, quote, read_json
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import write_atomically, write_json
+from edge_se_sampler.engine.files import checksum, write_atomically, write_json
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
+
+FORMAT, OLDEST_FORMAT = 3, 2
+"""Of runs: the one written, and the oldest that is read. Format 2, without a number, has no checksums but those of
+checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +39,28 @@ class RunFolder:
         parent = config.output_dir / str(config.experiment_name) / config.method_name
         with os_errors_as_input_errors(f"--output-dir {config.output_dir}: cannot be written"):
             parent.mkdir(parents=True, exist_ok=True)
-            path = _new_folder(parent, time.strftime("%Y-%m-%d_%H%M%S"))
-            (path / "checkpoints").mkdir()
-            (path / "previews").mkdir()
-        run = cls(path)
-        run.write_config(config)
+            run = cls(_new_folder(parent, time.strftime("%Y-%m-%d_%H%M%S")))
+            try:
+                (run.path / "checkpoints").mkdir()
+                (run.path / "previews").mkdir()
+                run.write_config(config)
+            except (OSError, InputError):
+                shutil.rmtree(run.path, ignore_errors=True)
+                raise
         return run
 
     def write_config(self, config: TrainerConfig) -> None:
         """Write config.json; InputError if that fails."""
-        write_json(self.path / "config.json", config_to_json(config))
+        values = {"format": FORMAT, **config_to_json(config)}
+        write_json(self.path / "config.json", {**values, "checksum": checksum(values)})
 
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
 
     def config(self, method_configs: Mapping[str, TrainerConfig]) -> TrainerConfig:
-        """The run's settings, typed as its method's defaults; InputError if there are none of this version."""
+        """The run's settings, typed as its method's defaults; InputError if there are none of this version, or they are
+        not as they were written. Who changes them by hand removes the checksum."""
         path = self.path / "config.json"
         if not self.path.is_dir():
             raise InputError(f"{self.path}: no such run folder; edge-se train prints where a run lands")
@@ -57,13 +68,22 @@ class RunFolder:
             raise InputError(f"{self.path}: not a run folder (no config.json); edge-se train prints it")
         for name in ("config.json", "metrics.jsonl", "checkpoints", "previews"):
             locate_file(self.path, name, SourceLocation(self.path))
-        values = read_json(path).object()
+        written = read_json(path).object()
+        claimed = written.pop("checksum", None)
+        number = written.get("format", OLDEST_FORMAT)
+        if number not in range(OLDEST_FORMAT, FORMAT + 1):
+            problem = f"its format is {quote(number)}, this version reads {OLDEST_FORMAT} to {FORMAT}"
+            raise InputError(f"{path}: {problem}")
+        values = {key: value for key, value in written.items() if key != "format"}
         name = values.get("method_name")
         default = method_configs.get(str(name))
         if default is None:
             problem = f"method_name is {quote(name)}, which is not registered here"
             raise InputError(f"{path}: {problem}; see edge-se methods")
         config = config_from_json(default, values, f"{path}")
+        if claimed not in (None, checksum(written)):
+            remedy = 'restore it, or, if you did, remove its "checksum"'
+            raise InputError(f"{path}: changed since it was written (checksum); {remedy}")
         try:
             config.check()
         except InputError as problem:
@@ -74,24 +94,32 @@ class RunFolder:
         """Append a line to metrics.jsonl; InputError if it cannot be written."""
         path = self.path / "metrics.jsonl"
         with os_errors_as_input_errors(f"{path}: cannot be written"), open(path, "a", encoding="utf-8") as file:
-            file.write(json.dumps(line, allow_nan=False) + "\n")
+            file.write(_checked_line(line))
 
     def metrics(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; a last line cut short by a kill is left out. InputError if it is damaged."""
+        """The lines of metrics.jsonl; a last line cut short by a kill is left out, and that is said. InputError if one
+        is not as it was written."""
         path = self.path / "metrics.jsonl"
         if not path.exists():
             return []
         try:
-            lines = [json.loads(line) for line in path.read_text(encoding="utf-8").split("\n")[:-1]]
-            if not all(isinstance(line["step"], int) for line in lines):
-                raise TypeError("a step is no number")
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as problem:
+            has_checksums = read_json(self.path / "config.json").object().get("format", 2) > 2
+            *complete, rest = path.read_text(encoding="utf-8").split("\n")
+            lines = [json.loads(line) for line in complete]
+            for line in lines:
+                claimed = line.pop("crc32", None)
+                is_checked = claimed == _crc32(line) or (claimed is None and not has_checksums)
+                if not isinstance(line["step"], int) or not is_checked:
+                    raise ValueError(f"the line of step {line['step']} is not as it was written")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as problem:
             raise InputError(f"{path}: damaged ({quote(problem)}); mend or remove it") from problem
+        if rest:
+            print(f"edge-se: {path}: its last line was cut short and is left out", file=sys.stderr)
         return lines
 
     def drop_metrics_after(self, step: int) -> None:
         """Drop the metrics of later steps, which a resumed run writes again."""
-        kept = [json.dumps(line) + "\n" for line in self.metrics() if line["step"] <= step]
+        kept = [_checked_line(line) for line in self.metrics() if line["step"] <= step]
         write_atomically(self.path / "metrics.jsonl", "".join(kept).encode())
 
 
@@ -104,17 +132,19 @@ class EventWriter:
     def write(self, line: dict[str, Any]) -> None:
         if find_spec("tensorboard") is None:
             return
-        if self._writer is None:
-            from torch.utils.tensorboard import SummaryWriter
+        with os_errors_as_input_errors(f"{self._folder}: TensorBoard's events cannot be written"):
+            if self._writer is None:
+                from torch.utils.tensorboard import SummaryWriter
 
-            self._writer = SummaryWriter(str(self._folder))
-        for key, value in line.items():
-            if key != "step" and isinstance(value, int | float):
-                self._writer.add_scalar(key, value, line["step"])
+                self._writer = SummaryWriter(str(self._folder))
+            for key, value in line.items():
+                if key != "step" and isinstance(value, int | float):
+                    self._writer.add_scalar(key, value, line["step"])
 
     def close(self) -> None:
         if self._writer is not None:
-            self._writer.close()
+            with os_errors_as_input_errors(f"{self._folder}: TensorBoard's events cannot be written"):
+                self._writer.close()
 
 
 def _new_folder(parent: Path, name: str) -> Path:
@@ -127,25 +157,48 @@ def _new_folder(parent: Path, name: str) -> Path:
             return path
 
 
+def _crc32(line: dict[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(line, allow_nan=False).encode()):08x}"
+
+
+def _checked_line(line: dict[str, Any]) -> str:
+    """A line of metrics.jsonl, with a checksum of the rest as its last entry."""
+    return json.dumps({**line, "crc32": _crc32(line)}) + "\n"
+
+
 def config_to_json(config: TrainerConfig) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config), default=os.fspath))
 
 
 def config_digest(config: TrainerConfig) -> str:
-    """A hash of every setting that a resumed run must share: not of paths, time limits, checkpoints and the device."""
+    """A hash of every setting that a resumed run must share: not of paths, when to stop, checkpoints and the device."""
     values = config_to_json(config)
-    for name in ("output_dir", "data", "max_seconds", "steps_per_save"):
-        del values[name]
+    _drop_added_defaults(config, values)
+    for name in ("output_dir", "data", "max_seconds", "steps_per_save", "new_num_iterations", "patience", "min_gain"):
+        values.pop(name, None)
     if config.time_budget is not None:
         del values["segments"]  # known at the end only
     del values["machine"]["device_type"]
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    return checksum(values)
+
+
+def _drop_added_defaults(config: Any, values: dict[str, Any]) -> None:
+    """Drop the defaults of fields that were added later: earlier versions wrote digests without them."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            _drop_added_defaults(value, values[field.name])
+        elif field.metadata.get("added_later") and value == field.default:
+            del values[field.name]
 
 
 def config_from_json(default: Any, values: Any, where: str) -> Any:
-    """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped."""
-    types = get_type_hints(type(default))
-    hints = {field.name: types[field.name] for field in dataclasses.fields(default)}
+    """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped.
+    Fields that were added later may be missing: they have their defaults."""
+    types, fields = get_type_hints(type(default)), dataclasses.fields(default)
+    hints = {field.name: types[field.name] for field in fields}
+    if isinstance(values, dict):
+        values = {f.name: f.default for f in fields if f.metadata.get("added_later")} | values
     if not isinstance(values, dict) or set(values) != set(hints):
         differing = quote(sorted(set(values) ^ set(hints)) if isinstance(values, dict) else "not an object")
         raise InputError(f"{where}: written by another version of edge-se or edited by hand (fields: {differing})")

@@ -7,7 +7,6 @@ continues from before a kernel, which knows no bounds, sees it.
 from __future__ import annotations
 
 import io
-import math
 import pickletools
 import zipfile
 from collections.abc import Callable, Mapping
@@ -19,7 +18,8 @@ from torch import Tensor
 from edge_se_sampler.engine.plan import NUM_SEGMENTS
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
-from edge_se_sampler.sampling.error_map import ErrorMap
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
+from edge_se_sampler.sampling.saved_sampler import MAX_STEP, is_alike, is_finite, is_sampler_state
 
 GLOBALS = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2"} | {
     f"torch {kind}Storage" for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Byte", "Bool")
@@ -29,9 +29,10 @@ PARTS = {
     *("step", "elapsed", "config_digest", "model", "plan"),
     *("optimizer", "scheduler", "dead_network_reset", "sampler"),
 }
+ADDED_PARTS = {"early_stopping", "data_digest"}
+"""Which those of format 2 lack."""
 GROUP = {"params", "lr", "betas", "eps", "weight_decay", "amsgrad", "initial_lr", "maximum", "total_variation"}
 """What Adam's groups have in every version of torch, and ours."""
-MAX_STEP = 2**40
 
 
 def check_archive(payload: bytes) -> None:
@@ -84,13 +85,14 @@ def check_parts(state: dict[str, Any], config: ModelConfig) -> None:
     memory is asked for none that are not there."""
     weights: Any = state.get("model")
     valid = (
-        set(state) == PARTS
+        PARTS <= set(state) <= PARTS | ADDED_PARTS
         and isinstance(weights, dict)
         and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())
         and all(isinstance(state[name], dict) for name in ("plan", "scheduler", "sampler"))
+        and isinstance(state.get("data_digest", ""), str)
         and type(state["step"]) is int
         and 0 <= state["step"] < MAX_STEP
-        and _is_finite(state["elapsed"])
+        and is_finite(state["elapsed"])
     )
     if valid and isinstance(config, NeRFModelConfig):
         depth, width = config.preset.depth, config.preset.width
@@ -102,12 +104,15 @@ def check_parts(state: dict[str, Any], config: ModelConfig) -> None:
 def check_training(state: Mapping[str, Any], trainer: Any) -> None:
     """InputError if a trainer cannot continue from a checkpoint's state; its weights are the trainer's model's."""
     _require(_is_training, state, trainer)
-    check_sampler(state["sampler"], trainer.pipeline.datamanager)
 
 
-def check_sampler(state: Mapping[str, Any], manager: Any) -> None:
-    """InputError if a data manager's sampler cannot continue from a state."""
-    _require(_is_sampler, state, manager)
+def load_sampler(manager: Any, state: Mapping[str, Any]) -> None:
+    """Let a data manager's sampler continue from a checkpoint's state; InputError if it cannot."""
+    sampler = manager.train_pixel_sampler
+    if state and isinstance(sampler, ImportantPixels):
+        images = {number: tuple(image.shape[:2]) for number, image in enumerate(manager.image_batch["image"])}
+        _require(is_sampler_state, state, sampler, images)
+    manager.load_state_dict(state)
 
 
 def _require(is_valid: Callable[..., bool], *arguments: Any) -> None:
@@ -123,25 +128,22 @@ def _is_training(state: Mapping[str, Any], trainer: Any) -> bool:
     optimizer, scheduler, reset = (state[key] for key in ("optimizer", "scheduler", "dead_network_reset"))
     own = trainer.scheduler.state_dict()
     own_reset = None if trainer.dead_network_reset is None else trainer.dead_network_reset.state_dict()
-    segments = state["plan"]["segments"]
+    segments, stopping = state["plan"]["segments"], state.get("early_stopping")
     return (
-        _is_alike(state["plan"], trainer.plan.state_dict() | {"segments": [0] * len(segments)})
+        is_alike(state["plan"], trainer.plan.state_dict() | {"segments": [0] * len(segments)})
         and len(segments) <= NUM_SEGMENTS
         and all(0 <= length < MAX_STEP for length in segments)
-        and _is_alike({key: scheduler.get(key, own[key]) for key in own}, own)
+        and is_alike({key: scheduler.get(key, own[key]) for key in own}, own)
         and scheduler["last_epoch"] == state["step"] + 1
-        and _is_alike(reset, own_reset)
+        and is_alike(reset, own_reset)
+        and (stopping is None or _is_early_stopping(stopping, trainer.early_stopping.state_dict()))
         and (optimizer is None or _is_optimizer(optimizer, trainer.optimizer))
     )
 
 
-def _is_sampler(state: Mapping[str, Any], manager: Any) -> bool:
-    own = manager.state_dict()
-    images = {number: tuple(image.shape[:2]) for number, image in enumerate(manager.image_batch["image"])}
-    return state.keys() == own.keys() and all(
-        _is_error_map(state[name], images) if "sizes" in part else _is_alike(state[name], part)
-        for name, part in own.items()
-    )
+def _is_early_stopping(state: Any, own: dict[str, Any]) -> bool:
+    best = state["best"]  # -inf before the first
+    return isinstance(best, float) and best == best and is_alike(state | {"best": 0.0}, own | {"best": 0.0})
 
 
 def _other_training() -> InputError:
@@ -159,7 +161,7 @@ def _is_optimizer(state: Any, optimizer: torch.optim.Optimizer) -> bool:
     for group, own_group in zip(state["param_groups"], own["param_groups"], strict=True):
         if not all(group[key] == own_group[key] for key in group.keys() & own_group.keys() - {"lr"}):
             return False
-        if not (GROUP <= group.keys() <= own_group.keys() and _is_finite(group["lr"]) and group["lr"] >= 0):
+        if not (GROUP <= group.keys() <= own_group.keys() and is_finite(group["lr"]) and group["lr"] >= 0):
             return False
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     return isinstance(state["state"], dict) and all(
@@ -181,40 +183,3 @@ def _are_moments(moments: Any, weight: Tensor) -> bool:
         and square.shape in shapes
         and steps.shape == ()
     )
-
-
-def _is_error_map(state: Any, images: Mapping[int, tuple[int, int]]) -> bool:
-    """Whether an `ErrorMap` of some of the images can have that state."""
-    if not isinstance(state, dict) or set(state) != {"sizes", "values", "updated", "sum"}:
-        return False
-    listed = state["sizes"]
-    if not isinstance(listed, list) or not _is_alike(listed, [[0, 0, 0]] * len(listed)):
-        return False
-    sizes = {size[0]: tuple(size[1:]) for size in listed}
-    if len(sizes) != len(listed) or any(images.get(number) != size for number, size in sizes.items()):
-        return False
-    error_map = ErrorMap()
-    error_map.add({number: images[number] for number in sizes})
-    kinds = {"values": torch.float32, "updated": torch.int32}
-    tensors = all(isinstance(state[name], Tensor) and state[name].dtype == kind for name, kind in kinds.items())
-    return tensors and all(state[name].shape == (len(error_map),) for name in kinds) and _is_finite(state["sum"])
-
-
-def _is_alike(found: Any, own: Any) -> bool:
-    """Whether a value is of another's kind: dicts have the same keys, numbers are finite."""
-    if isinstance(own, dict):
-        same = isinstance(found, dict) and found.keys() == own.keys()
-        return same and all(_is_alike(found[key], own[key]) for key in own)
-    if isinstance(own, (list, tuple)):
-        if not isinstance(found, (list, tuple)):
-            return False
-        return len(found) == len(own) and all(map(_is_alike, found, own))
-    if isinstance(own, str):
-        return found in ("early", "late")  # of phases alone
-    if isinstance(own, (int, float)):
-        return type(found) is bool if type(own) is bool else _is_finite(found)
-    return found is None and own is None
-
-
-def _is_finite(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) < MAX_STEP**2 and math.isfinite(value)

@@ -7,19 +7,24 @@ import ctypes
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from edge_se_sampler import ranks
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
+from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.checkpoint import load_latest
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, resolve_depths, saved_grid
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import to_pictures
+from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.saved_state import check_parts
 from edge_se_sampler.engine.trainer import Trainer
@@ -34,9 +39,14 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
-    views, device = read_train_views(config), choose_device(config.machine.device_type)
+    device = choose_device(config.machine.device_type)
+    ranks.join(device)
+    views = read_train_views(config)
     held_out = _read_first_split(config, ("val", "test"))
-    preview = None if held_out is None else to_pictures(held_out)[0]
+    preview = None if held_out is None else _first_picture(held_out)
+    check_value(
+        "patience", config.patience, config.patience is None or preview is not None, "left out: no view is held out"
+    )
     began = time.monotonic()
     config = resolve_config(config, views)
     setup_seconds = time.monotonic() - began
@@ -46,7 +56,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
         disable_malloc_trimming()
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid)
-    run = run or RunFolder.create(config)
+    run = run or ranks.share(lambda: RunFolder.create(config))
     setup_seconds += time.monotonic() - began
     return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
 
@@ -55,7 +65,7 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     """The config with nothing left open, its size decided by the training views; a resolved one stays as it is,
     whatever the views. InputError if a value is out of its range."""
     config.check_plan()
-    data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.images)
+    data, model = config.data and config.data.resolve(), decide_size(config.pipeline.model, views.longest_side)
     model, _ = resolve_depths(views, model)
     config = replace(config, pipeline=replace(config.pipeline, model=model))
     preset, by_steps = config.preset, config.time_budget is None and config.segments is None
@@ -78,22 +88,47 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     return resolved
 
 
-def prepare_resume(run: RunFolder, config: TrainerConfig, max_seconds: float | None = None) -> Trainer:
-    """Continue an interrupted run under its own settings, but for max_seconds; InputError for a bad run or data."""
-    config = replace(config, max_seconds=max_seconds)
-    config.check()
-    state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
+def load_state(run: RunFolder, config: TrainerConfig) -> tuple[Path, dict[str, Any]]:
+    """A run's last checkpoint, and what it holds; InputError if it is bad."""
+    checkpoint, state = load_latest(run.checkpoints, config_digest(config))
     check_parts(state, config.pipeline.model)
-    trainer = prepare(config, run, saved_grid(state["model"]))
-    trainer.resume(state)
+    return checkpoint, state
+
+
+def prepare_resume(
+    run: RunFolder,
+    config: TrainerConfig,
+    max_seconds: float | None = None,
+    max_num_iterations: int | None = None,
+    changed_data: bool = False,
+) -> Trainer:
+    """Continue a run under its own settings, but for max_seconds, and max_num_iterations if that is given: what a
+    finished one then goes on with is its optimizer's state. InputError for a bad run or data, and for training images
+    that have changed, unless that is accepted; what the sampler remembers of them is then forgotten."""
+    _, state = load_state(run, config)
+    if max_num_iterations is not None:
+        config = _extend(config, state, max_num_iterations)
+    session_config = replace(config, max_seconds=max_seconds)
+    session_config.check()
+    trainer = prepare(session_config, run, saved_grid(state["model"]))
+    trainer.resume(state, changed_data)
+    run.write_config(config)
+    make_folder(run.path / "previews", "RUN")  # which git, for one, leaves out when it is empty
     return trainer
+
+
+def _extend(config: TrainerConfig, state: dict[str, Any], num_iterations: int) -> TrainerConfig:
+    """The config of a run that is to have so many iterations in all; InputError if it cannot have them."""
+    flag, done = "max-num-iterations", state["step"] + 1
+    check_value(flag, num_iterations, num_iterations > done, f"above {done}, the iterations that are done")
+    check_value(flag, num_iterations, config.max_num_iterations is not None, "left out: this run's length is a time")
+    check_value(flag, num_iterations, state["optimizer"] is not None, "left out: this run ended without its optimizer")
+    return replace(config, new_num_iterations=num_iterations)
 
 
 def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     """A run's model with the weights of its last checkpoint, and that checkpoint; InputError if it is bad."""
-    checkpoint = latest_checkpoint(run.checkpoints)
-    state = load_checkpoint(checkpoint, config_digest(config))
-    check_parts(state, config.pipeline.model)
+    checkpoint, state = load_state(run, config)
     model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
     load_weights(model, state["model"])
     return model, checkpoint
@@ -115,19 +150,31 @@ def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views |
     return next((views for views in found if views is not None), None)
 
 
+def _first_picture(views: Views) -> Picture:
+    """The first view of which some pixels are known, without converting the others."""
+    return next(picture for i in range(len(views.names)) for picture in to_pictures(views.subset([i])))
+
+
 def read_train_views(config: TrainerConfig) -> Views:
     """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
     if config.data is None:
         raise InputError("--data is missing: the folder to train on (edge-se scenes makes some)")
-    views = _read_split(config, "train")
+    views = _read_split(config, "train", partial(_training_memory, config))
     assert views is not None
     selected = select_views(config, len(views.names))
     return views if selected is None else views.subset(selected)
 
 
-def _read_split(config: TrainerConfig, split: Split) -> Views | None:
+def _training_memory(config: TrainerConfig, longest: int) -> int:
+    """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's."""
+    if choose_device(config.machine.device_type) != "cpu":
+        return 0
+    return decide_size(config.pipeline.model, longest).training_memory
+
+
+def _read_split(config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda longest: 0) -> Views | None:
     assert config.data is not None
-    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale)
+    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory)
     with Progress(0, "reading images") as progress:
         return read_split(config.data, split, settings, progress.update)
 
@@ -158,6 +205,7 @@ def describe_run(trainer: Trainer) -> str:
     lines = [
         f"run      {trainer.run.path}",
         f"data     {trainer.pipeline.data_summary}",
+        *[f"memory   {trainer.pipeline.memory_summary}"] * bool(trainer.pipeline.memory_summary),
         f"depths   {model.near:g} to {model.far:g}",
         f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
         f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",

@@ -17,12 +17,18 @@ from edge_se_sampler.sampling.edges import luma, unit_float
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.parts import Distribution
 from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
-from edge_se_sampler.sampling.strategies import DISTRIBUTIONS
 
 
 def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np.ndarray:
     """Probability of every pixel of the kth view, (H, W); it sums to 1, or to 0 if all pixels are masked."""
+    if type(distribution).strength is Distribution.strength:  # it has tables of its own
+        height, width = batch.sizes[k]
+        pixels = torch.cartesian_prod(torch.tensor([k]), torch.arange(height), torch.arange(width))
+        p = distribution.density_ratio(batch, pixels).reshape(height, width).numpy()
+        p = p if batch.mask is None else p * batch.valid(k).numpy()
+        return p / max(p.sum(), 1e-30)
     table = PixelTable()
     strength = torch.from_numpy(distribution.strength(batch.image(k), batch.background_color))
     table.add([strength if batch.mask is None else strength * batch.valid(k)])
@@ -34,7 +40,7 @@ def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Pa
     InputError if matplotlib is missing, or the settings do not fit the images."""
     pyplot = require_pyplot()
     config.check()
-    distribution = DISTRIBUTIONS[strategy](config)
+    distribution = PIXEL_STRATEGIES[strategy].load()(config)
     batch = ImageBatch.of(image_batch(views), use_mask=not config.ignore_mask)
     chosen = np.unique(np.linspace(0, len(views.images) - 1, num_views).round().astype(int)).tolist()
     figure, axes = pyplot.subplots(len(chosen), 3, figsize=(9.6, 3.35 * len(chosen)), squeeze=False)

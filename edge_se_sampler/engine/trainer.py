@@ -15,8 +15,10 @@ import torch
 from torch.optim.lr_scheduler import LambdaLR
 from tqdm import tqdm
 
+from edge_se_sampler import ranks
 from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.early_stopping import EarlyStopping
 from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.optimizers import create_adam, learning_rate_factor
 from edge_se_sampler.engine.pipeline import Pipeline, load_weights
@@ -25,7 +27,8 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
 from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
-from edge_se_sampler.engine.saved_state import check_training
+from edge_se_sampler.engine.saved_state import check_training, load_sampler
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
 
@@ -44,7 +47,9 @@ class Trainer:
         setup_seconds: float = 0.0,
     ) -> None:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
-        self.plan = Plan(config.max_num_iterations, config.segments or (), config.budget_seconds)
+        num_steps = config.new_num_iterations or config.max_num_iterations
+        self.plan = Plan(num_steps, config.segments or (), config.budget_seconds)
+        self.early_stopping = EarlyStopping(config.patience, config.min_gain)
         self.setup_seconds = setup_seconds
         self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset, config.optimizer)
         self.scheduler = LambdaLR(self.optimizer, self._learning_rate_factor)
@@ -71,8 +76,13 @@ class Trainer:
     def _learning_rate_factor(self, step: int) -> float:
         return learning_rate_factor(self.config.optimizer, self.progress(step), step)
 
-    def resume(self, state: dict[str, Any]) -> None:
-        """Continue from a checkpoint's state; InputError if it is another model's."""
+    def resume(self, state: dict[str, Any], changed_data: bool = False) -> None:
+        """Continue from a checkpoint's state; InputError if it is another model's, or, unless that is accepted, of
+        other training images. What the sampler remembers of others is forgotten."""
+        is_same_data = state.get("data_digest", self.pipeline.data_digest) == self.pipeline.data_digest
+        if not (is_same_data or changed_data):
+            remedy = "restore them, or add --changed-data True"
+            raise InputError(f"{self.config.data}: not the training images that the run began with; {remedy}")
         load_weights(self.pipeline.model, state["model"])
         check_training(state, self)
         if state["optimizer"] is not None:  # of a run that has ended
@@ -81,42 +91,50 @@ class Trainer:
         self.scheduler.load_state_dict(state["scheduler"])
         if self.dead_network_reset is not None:
             self.dead_network_reset.load_state_dict(state["dead_network_reset"])
-        self.pipeline.datamanager.load_state_dict(state["sampler"])
+        self.early_stopping.load_state_dict(state.get("early_stopping", {}))
+        if is_same_data:
+            load_sampler(self.pipeline.datamanager, state["sampler"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
-        self.run.drop_metrics_after(state["step"])
+        for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
+            group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another
+        if ranks.is_main():
+            self.run.drop_metrics_after(state["step"])
 
     def train(self) -> None:
-        """Train until the planned iterations are done, max_seconds have passed, or Ctrl-C; then save.
+        """Train until the planned iterations are done, max_seconds have passed, patience is lost, or Ctrl-C; then save.
         FloatingPointError if the loss or a weight is not finite: the last checkpoint is kept."""
         config = self.config
         began = time.monotonic() - self.elapsed
         deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds
         plan = self.plan
+        (self.setup_seconds,) = ranks.agree(self.setup_seconds)
         plan.decide(self.next_step, self.setup_seconds + self.elapsed)
         with self._interruptible(), Progress(plan.num_steps or 0, config.method_name, self.next_step) as progress:
             while self.next_step != plan.num_steps:
                 step = self.next_step
-                learning_rate = float(self.scheduler.get_last_lr()[0])
+                learning_rate = float(self.optimizer.param_groups[0]["lr"])
                 with self.turns:
                     loss = self.train_iteration(step)
-                self.next_step, self.elapsed = step + 1, time.monotonic() - began
+                self.next_step = step + 1
+                stopping = self.stop_requested or time.monotonic() >= deadline
+                self.elapsed, stopping = ranks.agree(time.monotonic() - began, stopping)
                 plan.decide(self.next_step, self.setup_seconds + self.elapsed)
                 ended = self.next_step == plan.num_steps
-                stop = ended or self.stop_requested or time.monotonic() >= deadline
                 if ended or step % config.steps_per_log == 0:
                     strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
                     self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
                 if ended or self._preview_is_due():
                     with self.turns:
                         self._preview(step)
+                    stopping = ranks.share(lambda: self.early_stopping.is_due) or stopping
                     began = time.monotonic() - self.elapsed  # a preview is not training time
-                if stop or self.next_step % config.steps_per_save == 0:
+                if ended or stopping or self.next_step % config.steps_per_save == 0:
                     self.save()
                 total = plan.num_steps or round(self.next_step / max(plan.progress(self.next_step), 1e-3))
                 progress.update(self.next_step, total, note=self._status(loss))
-                if stop:
+                if stopping:
                     break
-        if plan.time_budget is not None and self.next_step == plan.num_steps:
+        if ranks.is_main() and plan.time_budget is not None and self.next_step == plan.num_steps:
             self.config = replace(config, segments=tuple(plan.segments))
             self.run.write_config(self.config)
         self.events.close()
@@ -132,36 +150,39 @@ class Trainer:
         rays, batch = self.pipeline.datamanager.next_train(step)
         self.optimizer.zero_grad()
         batch.pop("full_image", None)  # whole images: not indexed by ray
-        errors = []
+        errors = torch.zeros(len(rays), dtype=model.dtype, device=model.device)
 
         def training_loss(rows: slice) -> torch.Tensor:
             loss, error = model.training_loss(rays[rows], {key: value[rows] for key, value in batch.items()})
-            errors.append(error)
+            errors[rows] = error
             return loss
 
         loss = self._backward(len(rays), training_loss)
         if model.num_unseen_rays:
             unseen = self.pipeline.datamanager.unseen_rays(model.num_unseen_rays, stream(seed, step, Stream.UNSEEN))
             loss += self._backward(len(unseen), lambda rows: model.auxiliary_loss(unseen[rows]))
+        ranks.add_up_gradients(model.parameters(), loss)
         value = float(loss)
         if not math.isfinite(value):
             raise FloatingPointError(f"the loss is not finite at step {step}; try a lower --optimizer.lr")
         reinitialized = {} if self.dead_network_reset is None else self.dead_network_reset.after_backward()
         for network, sub_seed in reinitialized.items():
             message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
-            tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
+            if ranks.is_main():
+                tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
             self._record(step, reinitialized=network, sub_seed=sub_seed)
         self.optimizer.step()
         self.scheduler.step()
-        self.pipeline.datamanager.observe(torch.cat(errors))
+        self.pipeline.datamanager.observe(errors)
         for callback in self.callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return value
 
     def _backward(self, num_rays: int, loss_of: Callable[[slice], torch.Tensor]) -> torch.Tensor:
-        """Accumulate the gradients of the mean loss over rays, chunk by chunk, and return that mean."""
+        """Accumulate the gradients of the mean loss over rays, chunk by chunk, and return that mean; of several ranks,
+        each has its part of both sums."""
         loss = torch.zeros((), device=self.pipeline.model.device)
-        for rows in self.pipeline.model.chunks(num_rays):
+        for rows in self.pipeline.model.own_chunks(num_rays):
             chunk_loss = loss_of(rows).sum() / num_rays
             chunk_loss.backward()
             loss += chunk_loss.detach()
@@ -170,12 +191,15 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of the steps done so far; FloatingPointError, and no file, if a weight is not finite."""
         step = self.next_step - 1
-        ended = self.next_step == self.plan.num_steps
+        # for good: what has a number of iterations can be given a larger one
+        ended = self.next_step == self.plan.num_steps and self.config.max_num_iterations is None
         extremes = [
             torch.stack(torch.aminmax(weight)) for weight in self.pipeline.model.parameters()
         ]  # needs no memory
         if not torch.cat(extremes).isfinite().all():
             raise FloatingPointError(f"a weight is not finite after step {step}; try a lower --optimizer.lr")
+        if not ranks.is_main():
+            return
         state = {
             "step": step,
             "elapsed": self.elapsed,
@@ -186,10 +210,14 @@ class Trainer:
             "scheduler": self.scheduler.state_dict(),
             "dead_network_reset": None if self.dead_network_reset is None else self.dead_network_reset.state_dict(),
             "sampler": self.pipeline.datamanager.state_dict(),
+            "early_stopping": self.early_stopping.state_dict(),
+            "data_digest": self.pipeline.data_digest,
         }
         save_checkpoint(self.run.checkpoints, step, state)
 
     def _record(self, step: int, **values: Any) -> None:
+        if not ranks.is_main():
+            return
         line = {"step": step, **values, "seconds": round(self.elapsed, 3)}
         self.run.log(line)
         self.events.write(line)
@@ -203,8 +231,9 @@ class Trainer:
         return before < now
 
     def _preview(self, step: int) -> None:
-        if self.preview_picture is not None:
+        if self.preview_picture is not None and ranks.is_main():
             rendered, self._preview_psnr = render_view(self.pipeline.model, self.preview_picture)
+            self.early_stopping.update(self._preview_psnr)
             self._record(step, val_psnr=self._preview_psnr)
             write_image(self.run.path / "previews" / f"step-{step:09d}.png", rendered)
 

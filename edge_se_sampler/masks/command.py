@@ -12,7 +12,7 @@ import numpy as np
 
 from edge_se_sampler.data.capture import SPLITS
 from edge_se_sampler.data.dataset import DataSettings, list_frames
-from edge_se_sampler.data.frames import Frame
+from edge_se_sampler.data.frames import Frame, check_cameras
 from edge_se_sampler.data.image_file import read_image, turn_upright
 from edge_se_sampler.data.lens import Intrinsics
 from edge_se_sampler.data.mask_files import place_of_mask
@@ -31,21 +31,21 @@ NUM_SHOWN, SHOWN_SIDE = 8, 300
 OUTLINE = (230, 40, 40)
 
 
-def make_masks(folder: Path, settings: DataSettings, picture: Path) -> str:
-    """Write a mask for each image of a folder, 255 on the object, and the picture; returns lines about them.
+def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | None = None) -> str:
+    """Write a mask for each image of a folder, 255 on the object, into `out`, by default the folder itself, and the
+    picture; returns lines about them.
 
     Raises:
         InputError: too few images, some have masks or alpha already, in none is there an object, or masks cannot be
             written.
     """
     check_output(picture)
+    out = folder if out is None else out
     frames = _frames(folder, settings)
     places = [_place(folder, frame) for frame in frames]
-    targets = sorted({folder / place.relative_to(folder).parts[0] for place in places})
-    with staged_folders(folder, targets) as workspace:
-        pixels = max(frame.header.width * frame.header.height for frame in frames)
-        with ThreadPoolExecutor(num_workers(pixels)) as pool:
-            images = list(pool.map(_read_small, frames))
+    targets = sorted({out / place.relative_to(folder).parts[0] for place in places})
+    with staged_folders(out, targets) as workspace:
+        images = _read_images(frames)
         lenses = [_scaled_camera(frame, image) for frame, image in zip(frames, images, strict=True)]
         with Progress(0, "masks") as progress:
             masks = segment(images, lenses, [frame.pose for frame in frames], progress.update)
@@ -62,7 +62,10 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path) -> str:
     lines = [f"{len(masks)} masks in {', '.join(map(str, targets))}: the object covers {np.median(shares):.0%} of the "
              f"median image ({shares.min():.0%} to {shares.max():.0%})"]  # fmt: skip
     lines += [f"of {len(odd)} images all or nothing is object, {odd[0]} for one"] if odd else []
-    return "\n".join([*lines, f"look at {picture}; then: edge-se train lean-nerf --data {folder} --masks object"])
+    then = f"edge-se train lean-nerf --data {folder} --masks object"
+    if out != folder:
+        then = f"copy what is in {out} into {folder}, or into a copy of it; then: {then}"
+    return "\n".join([*lines, f"look at {picture}; then: {then}"])
 
 
 def _frames(folder: Path, settings: DataSettings) -> list[Frame]:
@@ -72,6 +75,7 @@ def _frames(folder: Path, settings: DataSettings) -> list[Frame]:
     if len(frames) < MIN_VIEWS:
         problem = f"has {len(frames)} images, of which masks cannot be refined across views"
         raise SourceLocation(folder).error(problem, f"give at least {MIN_VIEWS}")
+    check_cameras(frames)
     for frame in frames:
         if frame.mask is not None:
             raise frame.image.error(f"has a mask already: {frame.mask.path}", "use it, or remove all masks")
@@ -83,6 +87,17 @@ def _place(folder: Path, frame: Frame) -> Path:
         return place_of_mask(folder, frame.image.path)
     except ValueError:
         raise frame.image.error("lies outside of the scene's folder", "copy the images into it") from None
+
+
+def _read_images(frames: Sequence[Frame]) -> list[np.ndarray]:
+    """`_read_small` of all frames, many at a time."""
+    images: list[np.ndarray] = []
+    pixels = max(frame.header.width * frame.header.height for frame in frames)
+    with ThreadPoolExecutor(num_workers(pixels)) as pool, Progress(len(frames), "reading images") as progress:
+        for image in pool.map(_read_small, frames):
+            images.append(image)
+            progress.update(len(images))
+    return images
 
 
 def _read_small(frame: Frame) -> np.ndarray:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, TypeVar
 
-import numpy as np
-
 from edge_se_sampler.errors import InputError, check_value
-from edge_se_sampler.protocol import InstantiateConfig
+from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 
 INFINITY = float("inf")
 MAX_SAMPLES, MAX_RAYS = 2**14, 2**24
 """Of a ray along it, and rays of a step: more would be a mistake, or a stranger's."""
+BYTES_PER_RAY = 2**15
+"""Of the lean model's samples on a ray of a training step."""
 GIB_PER_PIXEL = 1 / 400
 """Memory of the lean model's cells, by the longest side of the images."""
+POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
+"""Points that NeRF evaluates at once, by device: bounds the memory. Each chunk draws its own jitter, so another value
+gives another (equally good) training run."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,11 @@ class ModelConfig(InstantiateConfig):
         """Whether the grid is the visual hull of the alpha masks, where there are any."""
         return True
 
+    @property
+    def training_memory(self) -> int:
+        """Bytes that training takes at most on a CPU, beside images; the size is decided."""
+        raise NotImplementedError
+
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
         near, far = self.depths
@@ -131,6 +139,8 @@ class NeRFModelConfig(ModelConfig):
     """Standard deviation of noise added to the raw density in training."""
     empty_space_skipping: bool = False
     """Evaluate the networks only in the cells that may hold something, by the cameras and alpha; see inspect."""
+    hard_samples: bool = field(default=False, metadata=ADDED_LATER)
+    """Evaluate all samples, but differentiate only those that matter, drawn by their gradients: cheaper, noisier."""
 
     @property
     def needs_grid(self) -> bool:
@@ -139,6 +149,15 @@ class NeRFModelConfig(ModelConfig):
     @property
     def culls_by_alpha(self) -> bool:
         return self.empty_space_skipping
+
+    @property
+    def training_memory(self) -> int:
+        """Of two networks the weights, their gradients and Adam's two means; of a chunk's points what each layer
+        returns, and its gradient."""
+        preset = self.preset
+        layers = preset.depth + 2  # one more for features, a half for the direction, the encodings
+        num_points = max(POINTS_PER_CHUNK["cpu"], 2 * preset.num_coarse_samples + preset.num_importance_samples)
+        return 4 * preset.width * layers * (2 * 4 * preset.width + 2 * num_points)
 
     def check(self, prefix: str = "") -> None:
         super().check(prefix)
@@ -197,6 +216,13 @@ class LeanModelConfig(ModelConfig):
     def culls_by_alpha(self) -> bool:
         return self.cull_by_alpha
 
+    @property
+    def training_memory(self) -> int:
+        """The rows of cells and their corners, and the samples of a step's rays."""
+        assert self.max_memory is not None
+        valid = 0 < self.max_memory < INFINITY  # what is not, is refused later
+        return int(self.max_memory * 2**30 if valid else 0) + BYTES_PER_RAY * self.preset.rays
+
     def check(self, prefix: str = "") -> None:
         super().check(prefix)
         step = self.step_size_voxels
@@ -250,10 +276,9 @@ class InfoNeRFModelConfig(NeRFModelConfig):
 Model = TypeVar("Model", bound=ModelConfig)
 
 
-def decide_size(config: Model, images: Sequence[np.ndarray]) -> Model:
-    """The config with what is left to the training images (H, W, 3|4) replaced by what suits them: size "auto" by their
-    longest side, and the lean model's memory."""
-    longest = max(max(image.shape[:2]) for image in images)
+def decide_size(config: Model, longest: int) -> Model:
+    """The config with what is left to the training images replaced by what suits the longest side of them, in pixels:
+    size "auto", and the lean model's memory."""
     if isinstance(config, LeanModelConfig) and config.max_memory is None:
         config = replace(config, max_memory=round(GIB_PER_PIXEL * longest, 3))
     if config.size != "auto":

@@ -62,7 +62,8 @@ class NeRFField(nn.Module):
         per_ray = F.linear(encoded, self.view.weight[:, width:], self.view.bias)
         h = F.linear(self.feature(h), self.view.weight[:, :width])
         if ray_indices is None:
-            h = (h.reshape(len(directions), -1, h.shape[1]) + per_ray[:, None]).reshape(h.shape)
+            samples = len(h) // max(1, len(directions))
+            h = (h.reshape(len(directions), samples, h.shape[1]) + per_ray[:, None]).reshape(h.shape)
         else:
             h = h + per_ray[ray_indices]
         return density, torch.sigmoid(self.color(F.relu(h, inplace=True)))

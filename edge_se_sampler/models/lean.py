@@ -161,12 +161,12 @@ class LeanModel(RayModel):
 
     def render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
         """Outputs of `forward`, and what they were made of."""
-        split = rays.split_pixels() if self.supersampled else rays
-        spans, jitter = self._spans(split), self.uniform(len(split), 1)[:, 0] if self.training else None
+        split, size = (rays.split_pixels(), 4) if self.supersampled else (rays, 1)
+        spans, jitter = self._spans(split), self.uniform(len(rays), size).reshape(-1) if self.training else None
         weights = self.density, self.features, self.fine.weights()
         rendered = choose_ops(self.density).render(self.grid, *weights, spans, jitter, self.marching)
         of_rays = rendered.rgb, rendered.accumulation, rendered.distance
-        rgb, accumulation, distance = (x.reshape(len(rays), -1, x.shape[1]).mean(dim=1) for x in of_rays)
+        rgb, accumulation, distance = (x.reshape(len(rays), size, x.shape[1]).mean(dim=1) for x in of_rays)
         background, passing = self.get_background(rays), 1 - accumulation
         outputs = {"rgb_fine": rgb + passing * background, "accumulation_fine": accumulation}
         if not self.training:

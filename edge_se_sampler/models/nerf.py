@@ -7,15 +7,12 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.data.cameras import RayBundle
-from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.models.config import POINTS_PER_CHUNK, NeRFModelConfig
 from edge_se_sampler.models.field import NeRFField
+from edge_se_sampler.models.hard_samples import evaluate_hard_samples
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.models.rendering import composite, importance, intervals, sample_weights, stratified
 from edge_se_sampler.occupancy.bricks import BrickGrid
-
-POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
-"""Points evaluated at once, by device: bounds the memory. Each chunk draws its own jitter, so another value gives
-another (equally good) training run."""
 
 
 class NeRFModel(RayModel):
@@ -75,15 +72,14 @@ class NeRFModel(RayModel):
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
         noise = None
         if self.training and self.config.density_noise:
-            draws = torch.randn(t.numel(), generator=self.random, device=self.device, dtype=self.dtype)
-            noise = draws * self.config.density_noise
+            noise = self.draw(torch.randn, *t.shape).reshape(-1) * self.config.density_noise
         if self.grid is None:
-            density, color = field(positions, rays.directions, None, noise)
+            density, color = self._evaluate(field, positions, rays.directions, None, noise)
         else:
             packed = torch.nonzero(self.grid.contains(positions))[:, 0]
             ray_indices = torch.div(packed, t.shape[1], rounding_mode="floor")
             noise = None if noise is None else noise[packed]
-            packed_density, packed_color = field(positions[packed], rays.directions, ray_indices, noise)
+            packed_density, packed_color = self._evaluate(field, positions[packed], rays.directions, ray_indices, noise)
             density = t.new_zeros(t.numel()).index_put((packed,), packed_density)
             color = t.new_zeros((t.numel(), 3)).index_put((packed,), packed_color)
         # a softplus is never 0: over an endless interval it would hide every background
@@ -91,3 +87,12 @@ class NeRFModel(RayModel):
         density = density.reshape(t.shape)
         weights = sample_weights(density, delta)
         return weights, composite(weights, color.reshape(*t.shape, 3), background), (density, delta)
+
+    def _evaluate(
+        self, field: NeRFField, positions: Tensor, directions: Tensor, ray_indices: Tensor | None, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """What the field returns; where gradients are wanted and the config says so, those of the hard samples only."""
+        if not (self.config.hard_samples and self.training and torch.is_grad_enabled()):
+            return field(positions, directions, ray_indices, noise)
+        uniform = self.uniform(len(positions), 1)[:, 0]
+        return evaluate_hard_samples(field, positions, directions, ray_indices, noise, uniform)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from edge_se_sampler import ranks
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.occupancy.bricks import BrickGrid
@@ -43,6 +44,8 @@ class RayModel(nn.Module, ABC):
         """Rays a step, of cameras between the training views, that `auxiliary_loss` regularizes."""
         self.random = torch.Generator()
         """Source of jitter, noise and random backgrounds; seeded at every training step."""
+        self._chunk_rays = 0
+        """Rays of the chunk, of all ranks, that is trained on."""
         self.background_fn: Callable[[RayBundle], Tensor] | None = None
         """n rays -> (n, 3) background colors in [0, 1], in place of the config's background color."""
 
@@ -63,6 +66,14 @@ class RayModel(nn.Module, ABC):
         """Slices of that many rays, each small enough to be rendered at once."""
         size = self.rays_per_chunk
         return (slice(start, start + size) for start in range(0, num_rays, size))
+
+    def own_chunks(self, num_rays: int) -> Iterator[slice]:
+        """`chunks` of a training step's rays; of several ranks each gets every so manieth ray of every chunk, and draws
+        for them what a single process would draw."""
+        for chunk in self.chunks(num_rays):
+            self._chunk_rays = min(chunk.stop, num_rays) - chunk.start
+            yield slice(chunk.start + ranks.rank(), chunk.stop, ranks.world_size())
+        self._chunk_rays = 0
 
     @abstractmethod
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
@@ -118,7 +129,15 @@ class RayModel(nn.Module, ABC):
 
     def uniform(self, rows: int, columns: int) -> Tensor:
         """(rows, columns) uniform draws in [0, 1) from the step's generator."""
-        return torch.rand((rows, columns), generator=self.random, device=self.device, dtype=self.dtype)
+        return self.draw(torch.rand, rows, columns)
+
+    def draw(self, kind: Callable[..., Tensor], rows: int, columns: int) -> Tensor:
+        """(rows, columns) draws from the step's generator by torch.rand or torch.randn; where a row is one of
+        `own_chunks`' rays, its part of the chunk's draws."""
+        own, whole = slice(ranks.rank(), None, ranks.world_size()), self._chunk_rays
+        if rows != len(range(whole)[own]):
+            own, whole = slice(None), rows
+        return kind((whole, columns), generator=self.random, device=self.device, dtype=self.dtype)[own]
 
 
 def target_colors(image: Tensor, background: Tensor) -> Tensor:

@@ -58,7 +58,7 @@ class LeanNerfModel(Model):
             grid, config = BrickGrid.from_cells(torch.zeros(3), 1.0, cells), replace(config, size="paper")
         else:
             views = metadata["read_views"]()
-            config, _ = resolve_depths(views, decide_size(config, views.images))
+            config, _ = resolve_depths(views, decide_size(config, views.longest_side))
             config.check("pipeline.model.")
             analysis = analyze_views(views, config)
             grid = analysis.grid()

@@ -32,15 +32,20 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
     images_per_step: Literal["one", "all"] = "all"
     """Draw a step's pixels from all loaded images (nerfstudio) or from one image (the paper); an image is chosen
     first, a pixel in it second."""
+    soft_mining_alpha: float = 0.0
+    """Loss weights of Soft Mining: none, for nerfstudio's losses take no weights."""
 
     def rules(self) -> list[tuple[str, bool, str]]:
         """Those of every host, and nerfstudio's."""
         no_weights = "nerfstudio's losses take no weights; leave it at 0, or train with edge-se"
+        needs_weights = "weights the loss, and nerfstudio's losses take no weights; train with edge-se"
         not_alone = "nerfstudio's models render coarse colors only together with the fine ones; take fine or cached"
         return [
             *super().rules(),
             ("importance_weight", not self.importance_weight, no_weights),
+            ("soft_mining_alpha", not self.soft_mining_alpha, no_weights),
             ("error_source", self.error_source != "coarse", not_alone),
+            *((phase, getattr(self, phase) != "expansive", needs_weights) for phase in ("early", "late")),
         ]
 
     def check(self) -> None:

@@ -85,7 +85,7 @@ def _lean_nerf() -> MethodSpecification:
     manager = LeanDataManagerConfig(
         dataparser=NerfstudioDataParserConfig(),
         train_num_rays_per_batch=preset.rays,
-        pixel_sampler=EdgeSEPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler)),
+        pixel_sampler=EdgeSEPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler) | {"soft_mining_alpha": 0.0}),
     )
     config = TrainerConfig(
         method_name="lean-nerf",

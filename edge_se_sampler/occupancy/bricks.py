@@ -16,6 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from edge_se_sampler import ranks
+
 BRICK = 4
 """Cells along a brick."""
 MAX_DISTANCE = 8
@@ -168,9 +170,10 @@ class BrickGrid(nn.Module):
         self.register_buffer("table", distance, persistent=False)
 
     def update_max_weight(self, rows: Tensor, weights: Tensor) -> None:
-        """Remember the weights (m,) of samples, by the rows (m,) int64 of their cells."""
+        """Remember the weights (m,) of samples, by the rows (m,) int64 of their cells; and those of all ranks."""
         self.max_weight.scatter_reduce_(0, rows, weights.to(self.max_weight.dtype), "amax")
-        self.num_seen += len(rows)
+        ranks.find_largest(self.max_weight)
+        self.num_seen += ranks.add_up(torch.tensor(len(rows)))
 
     def reset_max_weight(self) -> None:
         """Forget the weights seen so far."""

@@ -20,6 +20,7 @@ EdgeSource = Literal["color", "alpha", "both"]
 WHITE = (1.0, 1.0, 1.0)
 CANNY_THRESHOLDS = (100, 200)
 """Hysteresis thresholds on the 8-bit 3x3 Sobel magnitude; a full-contrast step answers 1020."""
+CHANGE_STEP = np.float32(2**-16)
 
 
 def unit_float(image: np.ndarray) -> np.ndarray:
@@ -102,3 +103,17 @@ def edge_strength(
         raise ValueError(f"edge source {source!r} needs images with an alpha channel; these have none: use 'color'")
     alpha = phi(np.ascontiguousarray(image[..., 3]))
     return alpha if source == "alpha" else np.maximum(phi(luma(image, background)), alpha)
+
+
+def color_change(image: np.ndarray, background: tuple[float, float, float] = WHITE) -> np.ndarray:
+    """How much the color changes around every pixel (Zhang et al. 2022, "Fast Learning Radiance Fields by Shooting Much
+    Fewer Rays", arXiv 2208.06821): the standard deviation of its 3 x 3 neighborhood, here of 8-bit luma. (H, W) float32
+    in [0, 0.5], exactly 0 where that is constant, multiples of CHANGE_STEP, so that sums in float64 are exact; borders
+    are replicated. Arguments and errors as `edge_strength`.
+    """
+    levels = np.rint(luma(unit_float(image), background) * np.float32(255))
+    total, squares = (
+        cv2.boxFilter(values, cv2.CV_32F, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
+        for values in (levels, levels * levels)
+    )  # of integers, exact
+    return np.rint(np.sqrt(9 * squares - total * total) * np.float32(1 / (9 * 255 * CHANGE_STEP))) * CHANGE_STEP

@@ -5,7 +5,6 @@ p/u  density ratio of a pixel: its probability as it was drawn over that under u
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,10 +15,14 @@ import torch
 from torch import Tensor
 
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling.cells import CellTable
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.random_streams import Stream, stream
+from edge_se_sampler.sampling.region_table import RegionTable
 from edge_se_sampler.sampling.settings import SamplingSettings
+
+PixelSource = UniformPixels | PixelTable | CellTable | RegionTable
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,10 @@ class PixelBatch:
     distribution: Distribution  # what drew them
     kept_ratio: Tensor | None = None
     """(n,) how much likelier than the average candidate each was kept by a selector; None: all were kept."""
+    drawn_ratio: Tensor | None = None
+    """(n,) p/u, of a distribution that will have changed when it is asked for."""
+    loss_weight: Tensor | None = None
+    """(n,) float32 loss weights that belong to the distribution's rule."""
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -53,7 +60,8 @@ class PixelBatch:
 
     def density_ratio(self, rows: slice = slice(None)) -> Tensor:
         """(n,) p/u of these pixels, or of some rows of them."""
-        ratio = self.distribution.density_ratio(self.batch, self.pixels[rows])
+        known, pixels = self.drawn_ratio, self.pixels[rows]
+        ratio = self.distribution.density_ratio(self.batch, pixels) if known is None else known[rows]
         return ratio if self.kept_ratio is None else ratio.float() * self.kept_ratio[rows]
 
     def take(self, rows: Tensor, kept_ratio: Tensor) -> PixelBatch:
@@ -81,17 +89,19 @@ class SamplerPart:
         """Continue from what `state_dict` returned."""
 
 
-class Distribution(SamplerPart, ABC):
+class Distribution(SamplerPart):
     """Draws pixels in proportion to their strength, image first, pixel second. An image's table is built when it is
-    first met, and kept: its pixels and its mask are taken to stay the same."""
+    first met, and kept: its pixels and its mask are taken to stay the same. A subclass defines `strength`, or draws
+    from `tables` of its own."""
 
     name: ClassVar[str]
+    new_table: ClassVar[type[PixelTable | RegionTable]] = PixelTable
+    """What its pixels are drawn from."""
 
     def __init__(self, settings: SamplingSettings) -> None:
         self.settings = settings
         self.clear()
 
-    @abstractmethod
     def strength(self, image: np.ndarray, background_color: tuple[float, float, float]) -> np.ndarray:
         """Strength of every pixel: (H, W) float, finite, >= 0; 0 is never drawn.
 
@@ -99,9 +109,11 @@ class Distribution(SamplerPart, ABC):
             image: (H, W, 3|4), uint8 or float in [0, 1].
             background_color: RGB in [0, 1] behind transparent pixels.
         """
+        raise NotImplementedError
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
-        """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`."""
+        """Draw `count` pixels with replacement, from one image or from all; raises as `drawable`. If it learns, their
+        p/u is kept."""
         rng = stream(step.seed, step.number, Stream.PIXELS)
         source, table_index, drawable = self.drawable(batch)
         if self.settings.images_per_step == "one":
@@ -109,7 +121,8 @@ class Distribution(SamplerPart, ABC):
         # strided: a table's draws come ordered by image
         pixels = source.draw(table_index[drawable], count * step.world, rng)[step.rank :: step.world]
         pixels[:, 0] = drawable[pixels[:, 0]]
-        return PixelBatch(batch, pixels, self)
+        drawn_ratio = self.density_ratio(batch, pixels) if self.needs_errors else None
+        return PixelBatch(batch, pixels, self, drawn_ratio=drawn_ratio)
 
     def density_ratio(self, batch: ImageBatch, pixels: Tensor) -> Tensor:
         """p/u (n,) of pixels (n, 3): position in the batch, row, column."""
@@ -118,31 +131,35 @@ class Distribution(SamplerPart, ABC):
 
     def clear(self) -> None:
         """Give back the memory of the tables."""
-        self._table, self._table_index = PixelTable(), dict[int, int]()
+        self._table, self._table_index = type(self).new_table(), dict[int, int]()
 
-    def tables(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor]:
+    def tables(self, batch: ImageBatch) -> tuple[PixelSource, Tensor]:
         """What is drawn from, and the index of each image of the batch in it, (k,) int64. InputError: an image has no
         strengths."""
         numbers = batch.numbers.tolist()
         new = [k for k, number in enumerate(numbers) if number not in self._table_index]
         if new:
             try:
-                self._table.add(in_threads(lambda k: self._valid_strength(batch, k), new))
+                self._table.add(in_threads(lambda k: self._named_strength(batch, k), new))
             except ValueError as problem:
                 raise InputError(str(problem)) from problem
             start = len(self._table_index)
             self._table_index.update({numbers[k]: start + i for i, k in enumerate(new)})
         return self._table, torch.tensor([self._table_index[number] for number in numbers])
 
-    def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
-        """(H, W) strengths of the image at position k, 0 where it is masked."""
+    def _named_strength(self, batch: ImageBatch, k: int) -> Tensor:
+        """What `_valid_strength` returns; InputError, naming the image, for its ValueError."""
         try:
-            strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
+            return self._valid_strength(batch, k)
         except ValueError as problem:
             raise InputError(f"image {int(batch.numbers[k])}: {problem}") from problem
+
+    def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
+        """(H, W) strengths of the image at position k, 0 where it is masked; raises as `strength`."""
+        strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
         return strength if batch.mask is None else strength * batch.valid(k)
 
-    def drawable(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor, Tensor]:
+    def drawable(self, batch: ImageBatch) -> tuple[PixelSource, Tensor, Tensor]:
         """What `tables` returns, and the positions of images with a pixel to draw, by ascending image number: hosts
         collate images in any order, and a draw should not depend on it. InputError: there is no pixel to draw, or an
         image has no strengths."""

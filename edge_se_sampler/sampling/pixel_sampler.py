@@ -89,13 +89,14 @@ class ImportantPixels:
     def check_images(self, image_batch: dict[str, Any]) -> None:
         """Before training, refuse images that a phase could draw nothing from: InputError as `sample`."""
         batch = self._read(image_batch)
-        for name in {self.config.early, Uniform.name}:
+        for name in self.strategies:
             self.strategies[name].distribution.drawable(batch)
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
 
-        With an importance weight the batch also has `weight` (N,), float32 loss weights.
+        With an importance weight, or a strategy that weights the loss, the batch also has `weight` (N,), float32 loss
+        weights.
 
         Raises:
             InputError: every pixel of every image is masked, or alpha edges of images without alpha.
@@ -112,7 +113,9 @@ class ImportantPixels:
         if self.needs_errors and not self._scored:
             self.pending_batch = drawn
         pixels = dict(drawn.values)
-        if self.config.importance_weight:
+        if drawn.loss_weight is not None:
+            pixels["weight"] = drawn.loss_weight.to(batch.device)
+        elif self.config.importance_weight:
             pixels["weight"] = (drawn.density_ratio() ** -self.config.importance_weight).float().to(batch.device)
         if self.config.keep_full_image:
             pixels["full_image"] = image_batch["image"]
@@ -127,20 +130,20 @@ class ImportantPixels:
     @property
     def needs_errors(self) -> bool:
         """Whether training has to tell it the squared errors that it finds, by `observe`."""
-        return self.is_bound and any(part.needs_errors for part in self._parts().values())
+        return self.is_bound and any(part.needs_errors for part in self.parts().values())
 
     def state_dict(self) -> dict[str, Any]:
         """What later draws depend on besides the step, for a checkpoint."""
-        states = {name: part.state_dict() for name, part in self._parts().items()}
+        states = {name: part.state_dict() for name, part in self.parts().items()}
         return {name: state for name, state in states.items() if state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned, once bound to a run with the same settings."""
-        parts = self._parts()
+        parts = self.parts()
         for name, part_state in state.items():
             parts[name].load_state_dict(part_state)
 
-    def _parts(self) -> dict[str, SamplerPart]:
+    def parts(self) -> dict[str, SamplerPart]:
         """Everything that may learn from errors, by its name in a checkpoint."""
         parts: dict[str, SamplerPart] = {"schedule": self.schedule}
         for name, strategy in self.strategies.items():
@@ -170,7 +173,7 @@ class ImportantPixels:
         return errors
 
     def _update(self, drawn: PixelBatch, squared_error: Tensor) -> None:
-        for part in self._parts().values():
+        for part in self.parts().values():
             if part.needs_errors:
                 part.update(drawn, squared_error.detach(), self._step)
 

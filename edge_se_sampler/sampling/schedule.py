@@ -13,14 +13,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
 from edge_se_sampler.sampling.background import PlainBackgrounds, summarize_errors
 from edge_se_sampler.sampling.parts import Distribution, PixelBatch, SamplerPart, TrainingStep
+from edge_se_sampler.sampling.registry import Phase
 
-Phase = Literal["early", "late"]
 Progress = Callable[[int], float]
 """The part of the training, in [0, 1], that is done when a step begins."""
 

@@ -6,25 +6,33 @@ Torch-free, so that `--help` need not wait for torch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from edge_se_sampler.errors import InputError
-from edge_se_sampler.protocol import PixelSamplerConfig
+from edge_se_sampler.errors import InputError, check_known
+from edge_se_sampler.protocol import ADDED_LATER, PixelSamplerConfig
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, strategy_names
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    EarlyStrategy = LateStrategy = str
+else:  # what --help lists
+    EarlyStrategy, LateStrategy = Literal[(*strategy_names("early"), "auto")], Literal[strategy_names("late")]
 
 
 @dataclass
 class SamplingSettings:
     """Which pixels train the network, early and late. Early and late together cover the paper's six strategies."""
 
-    early: Literal["uniform", "precrop", "edge", "auto"] = "edge"
-    """How pixels are drawn in the early phase: uniformly, from the center of the image, or in proportion to edge
-    strength; auto: uniformly where alpha tells where the object is, otherwise by edges under the adaptive schedule."""
-    late: Literal["uniform", "se"] = "se"
-    """How pixels are drawn afterwards: uniformly, or by the rank of their squared error among uniform candidates."""
+    early: EarlyStrategy = "edge"
+    """How pixels are drawn in the early phase: uniformly, from the center of the image, in proportion to edge
+    strength, or as the errors tell that training found (see sampling/README.md); auto: uniformly where alpha tells
+    where the object is, otherwise by edges under the adaptive schedule."""
+    late: LateStrategy = "se"
+    """How pixels are drawn afterwards: uniformly, by the rank of their squared error among uniform candidates, or as
+    the errors tell that training found. The same name as early's: all the time."""
     schedule: Literal["fraction", "steps", "adaptive"] = "fraction"
     """What ends the early phase: a share of the training; a number of steps; or (adaptive, for edges) that
     the object is learnt and edges no longer find larger errors. When either is no longer so, the phase returns."""
@@ -53,6 +61,10 @@ class SamplingSettings:
     importance_weight: float = 0.0
     """0: no loss weights, biased as in the paper; 1: inverse-probability weights, an unbiased loss; between: that
     power of the weights."""
+    soft_mining_alpha: float = field(default=0.6, metadata=ADDED_LATER)
+    """Soft Mining weights the loss by this power of 1 / error; 0: not at all."""
+    quadtree_threshold: float = field(default=0.015, metadata=ADDED_LATER)
+    """Root mean squared error of a channel above which the quadtree's leaves are subdivided, in [0, 1]."""
 
     def resolve_auto(self, has_masks: bool = False) -> Self:
         """Replace an `early` of auto.
@@ -69,7 +81,7 @@ class SamplingSettings:
     def rules(self) -> list[tuple[str, bool, str]]:
         """Field, whether its value has a meaning, and what is wrong if not."""
         in_steps, steps, weight = self.schedule == "steps", self.early_steps, self.importance_weight
-        all_uniform = self.early != "edge" and self.late == "uniform"
+        all_uniform = self.early in ("uniform", "precrop") and self.late == "uniform"
         epsilon_range = "must be between 1e-6 and 1e6 (less would never train flat regions)"
         not_in_steps = f"has no effect under schedule {self.schedule!r}; add --...schedule steps"
         needs_edges = "'adaptive' compares edges with uniform pixels: it needs early edge"
@@ -83,13 +95,29 @@ class SamplingSettings:
             ("se_candidates", self.se_candidates >= 2, "must be at least 2, or there is nothing to choose from"),
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
+            ("soft_mining_alpha", 0 <= self.soft_mining_alpha <= 1, "must be between 0 and 1"),
+            ("quadtree_threshold", 0 <= self.quadtree_threshold <= 1, "must be between 0 and 1"),
+            *self._strategy_rules(),
         ]
 
+    def _strategy_rules(self) -> Iterator[tuple[str, bool, str]]:
+        """Rules of the registered strategies."""
+        defaults = {setting.name: setting.default for setting in fields(self)}
+        for name, strategy in PIXEL_STRATEGIES.items():
+            phases = [phase for phase in strategy.phases if getattr(self, phase) == name]
+            for setting in strategy.settings:
+                no_effect = f"has no effect without {' or '.join(strategy.phases)} {name}"
+                yield setting, bool(phases) or getattr(self, setting) == defaults[setting], no_effect
+            for setting, values, problem in strategy.refusals:
+                yield setting, not phases or getattr(self, setting) in values, problem
+
     def check(self) -> None:
-        """Raise InputError for a value or a combination that has no meaning."""
-        for field, valid, problem in self.rules():
+        """Raise InputError for a value or a combination that has no meaning, or a strategy that is not known."""
+        check_known("pixel-sampler.early", [self.early], (*strategy_names("early"), "auto"))
+        check_known("pixel-sampler.late", [self.late], strategy_names("late"))
+        for setting, valid, problem in self.rules():
             if not valid:
-                raise InputError(f"pixel-sampler.{field.replace('_', '-')} is {getattr(self, field)!r}: {problem}")
+                raise InputError(f"pixel-sampler.{setting.replace('_', '-')} is {getattr(self, setting)!r}: {problem}")
 
 
 @dataclass

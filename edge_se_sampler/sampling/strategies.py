@@ -1,7 +1,4 @@
-"""The strategies by name. A new one is one class: a `Distribution` that says how strong each pixel of an image is (or
-draws in a way of its own), or a `Selector` that chooses among uniform candidates. Entered in `DISTRIBUTIONS` or
-`SELECTORS`, its name can stand for `early` or `late` in the settings.
-"""
+"""The paper's strategies, and how a sampler's are built by their names in the `registry`."""
 
 from __future__ import annotations
 
@@ -11,14 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge_se_sampler.errors import check_known
-from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling.distribution import UniformPixels
 from edge_se_sampler.sampling.edges import edge_strength
 from edge_se_sampler.sampling.error_map import ErrorMap
 from edge_se_sampler.sampling.image_batch import ImageBatch
-from edge_se_sampler.sampling.parts import Distribution, PixelBatch, Selector, TrainingStep
+from edge_se_sampler.sampling.parts import Distribution, PixelBatch, PixelSource, Selector, TrainingStep
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.ranking import sample_by_rank
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
@@ -38,7 +36,7 @@ class Uniform(Distribution):
         inside[top : top + height, left : left + width] = 1
         return inside
 
-    def tables(self, batch: ImageBatch) -> tuple[UniformPixels | PixelTable, Tensor]:
+    def tables(self, batch: ImageBatch) -> tuple[PixelSource, Tensor]:
         """Without masks no table is needed."""
         if batch.mask is not None:
             return super().tables(batch)
@@ -105,11 +103,6 @@ class RankedError(Selector):
             self.error_map.load_state_dict(state)
 
 
-DISTRIBUTIONS: dict[str, type[Distribution]] = {kind.name: kind for kind in (Uniform, Precrop, Edge)}
-SELECTORS: dict[str, type[Selector]] = {"se": RankedError}
-"""Both by the name that `early` and `late` give them; the candidates of a selector are uniform."""
-
-
 class Strategy(NamedTuple):
     """One way of choosing pixels."""
 
@@ -118,13 +111,17 @@ class Strategy(NamedTuple):
 
 
 def build_strategies(settings: SamplingSettings) -> dict[str, Strategy]:
-    """The early and the late strategy, and the uniform one, by their names; uniform tables are shared. InputError: an
-    unknown name."""
+    """The early and the late strategy, and the uniform one, by their names; uniform tables are shared. InputError: a
+    class that cannot be imported, or is neither a `Distribution` nor a `Selector`."""
     uniform = Uniform(settings)
     strategies = {Uniform.name: Strategy(uniform, Selector(settings))}
     for name in (settings.early, settings.late):
-        check_known("pixel-sampler", [name], (*DISTRIBUTIONS, *SELECTORS))
         if name not in strategies:
-            distribution = DISTRIBUTIONS[name](settings) if name in DISTRIBUTIONS else uniform
-            strategies[name] = Strategy(distribution, SELECTORS.get(name, Selector)(settings))
+            part = PIXEL_STRATEGIES[name].load()(settings)
+            if isinstance(part, Distribution):
+                strategies[name] = Strategy(part, Selector(settings))
+            elif isinstance(part, Selector):
+                strategies[name] = Strategy(uniform, part)
+            else:
+                raise InputError(f"pixel strategy {name!r}: {type(part).__name__} is no Distribution and no Selector")
     return strategies

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from threading import Condition
 from typing import Any
 
@@ -11,14 +12,14 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_checkpoint
+from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
-from edge_se_sampler.engine.run_folder import RunFolder, config_digest
-from edge_se_sampler.engine.saved_state import check_parts, check_sampler
-from edge_se_sampler.engine.session import choose_device, read_train_views
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.saved_state import load_sampler
+from edge_se_sampler.engine.session import choose_device, load_state, read_train_views
 from edge_se_sampler.engine.show import probability_map
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.engine.trajectories import find_up
@@ -57,26 +58,28 @@ class Viewed:
     def __init__(self, trainer: Trainer) -> None:
         self.trainer = trainer
         self.turns = trainer.turns = Turns()
+        self._newest: Path | None = None  # checkpoint that was looked at, whole or not
 
     @classmethod
     def load(cls, run: RunFolder, config: TrainerConfig) -> Viewed:
         """A run at its last checkpoint; nothing is written. InputError for a bad run or data."""
-        state = load_checkpoint(latest_checkpoint(run.checkpoints), config_digest(config))
-        check_parts(state, config.pipeline.model)
+        newest = latest_checkpoint(run.checkpoints)
+        _, state = load_state(run, config)
         device, views = choose_device(config.machine.device_type), read_train_views(config)
         pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
         load_weights(pipeline.model, state["model"])
         viewed = cls(config.setup(run=run, pipeline=pipeline, preview=None))
         viewed._take(state, pipeline.model)
+        viewed._newest = newest
         return viewed
 
     def reload(self) -> None:
         """Show a newer checkpoint if another process has written one; InputError if it cannot be read."""
         trainer = self.trainer
-        path = latest_checkpoint(trainer.run.checkpoints)
-        if path.stem != f"step-{trainer.next_step - 1:09d}":
-            state = load_checkpoint(path, config_digest(trainer.config))
-            check_parts(state, trainer.config.pipeline.model)
+        newest = latest_checkpoint(trainer.run.checkpoints)
+        if newest != self._newest:
+            self._newest = newest
+            _, state = load_state(trainer.run, trainer.config)
             model = build_model(trainer.config, str(trainer.pipeline.model.device), saved_grid(state["model"]))
             load_weights(model, state["model"])
             self._take(state, model)
@@ -84,10 +87,9 @@ class Viewed:
     def _take(self, state: dict[str, Any], model: Any) -> None:
         """Show a checkpoint's model, and its sampler."""
         trainer, manager = self.trainer, self.trainer.pipeline.datamanager
-        check_sampler(state["sampler"], manager)
         with self.turns:
+            load_sampler(manager, state["sampler"])
             trainer.pipeline, trainer.next_step = replace(trainer.pipeline, model=model), state["step"] + 1
-            manager.load_state_dict(state["sampler"])
             if isinstance(manager.train_pixel_sampler, ImportantPixels):
                 manager.train_pixel_sampler.set_step(state["step"])
 
@@ -132,7 +134,8 @@ class Viewed:
         use_mask, background = not sampler.config.ignore_mask, sampler.background_color
         batch = ImageBatch.of(manager.image_batch, use_mask=use_mask, background_color=background)
         distribution, selector = sampler.strategies[sampler.strategy]
-        p = probability_map(distribution, batch, k)
+        with self.turns:  # training changes what a distribution has learnt
+            p = probability_map(distribution, batch, k)
         if isinstance(selector, RankedError):
             errors = self._cached_errors(selector, batch, k)
             errors = squared_error() if errors is None else errors

@@ -162,6 +162,36 @@ def test_the_same_pixels_are_drawn_as_on_our_own_base(kind: str, strategy: str, 
     assert not torch.equal(*drawn)
 
 
+@pytest.mark.parametrize("name", ["error-map", "error-cdf", "soft-mining", "actray", "regions", "quadtree"])
+@pytest.mark.parametrize("kind", BATCHES)
+def test_strategies_that_learn_from_errors_draw_the_same_pixels_as_on_our_own_base(kind: str, name: str) -> None:
+    batch, settings = BATCHES[kind](), {"early": name, "late": name, "images_per_step": "all"}
+    unweighted = {"soft_mining_alpha": 0.0} if name == "soft-mining" else {}
+    ours = bound(settings_module.EdgeSEPixelSamplerConfig(**settings, **unweighted))
+    hosted = bound(EdgeSEPixelSamplerConfig(**settings))
+    for step in range(3, 9):
+        ours.set_step(step)
+        hosted.set_step(step)
+        expected, pixels = ours.sample(batch), hosted.sample(batch)
+        assert expected.keys() == pixels.keys()
+        assert all(torch.equal(expected[key], pixels[key]) for key in expected)
+        check_pixels(batch, pixels)
+        for sampler in (ours, hosted):
+            assert sampler.needs_errors
+            sampler.observe(scores(pixels))
+
+
+def test_the_hosts_losses_take_no_weights_of_soft_mining() -> None:
+    with pytest.raises(InputError, match=r"soft-mining-alpha is 0.6: nerfstudio's losses take no weights"):
+        EdgeSEPixelSamplerConfig(late="soft-mining", soft_mining_alpha=0.6).check()
+
+
+@pytest.mark.parametrize("phase", ["early", "late"])
+def test_expansive_supervision_is_refused_where_losses_take_no_weights(phase: str) -> None:
+    with pytest.raises(InputError, match=rf"{phase} is 'expansive': weights the loss, and nerfstudio's losses take no"):
+        EdgeSEPixelSamplerConfig(**{phase: "expansive"}).check()
+
+
 def test_the_strategies_are_not_all_the_same_draw() -> None:
     batch = BATCHES["stacked"]()
     drawn = [of_host(strategy, images_per_step="all").sample(batch)["indices"] for strategy in STRATEGY_SETTINGS]

@@ -12,8 +12,10 @@ import torch
 from edge_se_sampler.bench.machine import median_milliseconds, resident_memory
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.edges import edge_strength
+from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.ranking import sample_by_rank
+from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
@@ -36,7 +38,28 @@ def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
         # what nerfstudio's PixelSampler.sample_method computes without a mask
         "for comparison: nerfstudio 1.1.5's uniform pixels": lambda _: (torch.rand((draws, 3)) * extent).long(),
     }
+    for name in ("uniform", "error-map", "error-cdf", "soft-mining", "actray"):
+        cases[f"ten steps of `{name}`, of all images: pixels drawn, errors learnt from"] = ten_steps(
+            name, images, size, draws
+        )
     return {"tables": tables, "milliseconds": median_milliseconds(cases, rounds)}
+
+
+def ten_steps(late: str, images: int, size: int, draws: int) -> Callable[[int], None]:
+    """A function that takes ten steps with a strategy, on copies of one noise image, whose errors are random."""
+    config = EdgeSEPixelSamplerConfig(early="uniform", late=late, images_per_step="all")
+    sampler, errors = EdgeSEPixelSampler(config, num_rays_per_batch=draws), torch.rand(draws)
+    sampler.bind(squared_error=lambda _: errors, progress=lambda _: 1.0, seed=0)
+    noise = torch.randint(256, (1, size, size, 3), dtype=torch.uint8)
+    batch = {"image": noise.expand(images, -1, -1, -1), "image_idx": torch.arange(images)}
+
+    def take(number: int) -> None:
+        for step in range(10 * number + 1, 10 * number + 11):
+            sampler.set_step(step)
+            sampler.sample(batch)
+            sampler.observe(errors)
+
+    return take
 
 
 def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:

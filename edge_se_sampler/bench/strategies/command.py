@@ -1,0 +1,53 @@
+"""edge-se bench strategies. Torch-free until it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.runner import Experiment
+from edge_se_sampler.errors import InputError, check_known, check_value
+
+if TYPE_CHECKING:
+    from edge_se_sampler.bench.strategies.trials import Trial
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchStrategies(ExperimentCommand):
+    """Compare every way of choosing pixels with uniform pixels: real scenes, equal steps and equal CPU seconds, NeRF
+    and lean-nerf with and without masks. Resumes."""
+
+    scenes_dir: Path
+    """Folder of Blender scenes, such as NeRF-synthetic's (lego, chair, ...) with their official splits."""
+    models: tuple[Literal["nerf", "lean", "lean-no-masks"], ...] = ("nerf", "lean", "lean-no-masks")
+    """NeRF of size tiny; lean-nerf; and lean-nerf on images without alpha."""
+    scenes: tuple[str, ...] = ("lego", "chair")
+    """Folders in it."""
+    downscales: tuple[int, ...] = (8, 4)
+    """Every so many pixels along both axes become one."""
+    placements: tuple[Literal["centered", "shifted"], ...] = ("centered", "shifted")
+    """The scene as it is, or its copy by `edge-se offcenter`."""
+    plans: tuple[Literal["seconds", "steps"], ...] = ("seconds", "steps")
+    """Equal CPU seconds (NeRF 60, lean-nerf 10) or equal steps (NeRF 300, lean-nerf 800)."""
+    strategies: tuple[str, ...] = ()
+    """Ways of choosing pixels; none: all. --dry-run lists their names."""
+
+    def experiment(self) -> Experiment:
+        from edge_se_sampler.bench.strategies.trials import STRATEGIES, Settings, list_trials, run_trial, shifted_copy
+
+        check_known("strategies", self.strategies, STRATEGIES)
+        check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
+        for scene in self.scenes:
+            if not (self.scenes_dir / scene).is_dir():
+                raise InputError(f"--scenes-dir {self.scenes_dir}: has no folder {scene}; give the scenes' folder")
+        settings, scenes_dir, workplace = Settings(), self.scenes_dir.resolve(), self.workplace.resolve()
+        chosen = self.strategies or tuple(STRATEGIES)
+        trials = list_trials(self.models, self.scenes, self.downscales, self.placements, self.plans, chosen, self.seeds)
+
+        def arguments(trial: Trial) -> tuple[Settings, Path]:
+            scene = scenes_dir / trial.scene
+            return settings, scene if trial.placement == "centered" else shifted_copy(scene, workplace)
+
+        return Experiment("strategies", settings, lambda _: trials, run_trial, arguments)

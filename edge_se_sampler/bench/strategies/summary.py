@@ -1,0 +1,147 @@
+"""What the runs say of each strategy against uniform pixels, panel by panel: a model on images of a size, centered or
+not.
+
+Differences are taken between trainings of the same scene and seed, and means over scenes of the median over seeds. The
+spread of a number is the mean over scenes of its greatest minus its least value over seeds.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from edge_se_sampler.bench.outcomes import failed
+from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.strategies.trials import MODELS, PLACEMENTS, STRATEGIES, UNIFORM
+
+Verdict = Literal["better", "same", "worse"]
+METRICS = ("psnr", "foreground_psnr", "edge_band_psnr")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What is compared among itself."""
+
+    model: str
+    downscale: int
+    placement: str
+
+    @classmethod
+    def of(cls, run: Run) -> Panel:
+        return cls(run["model"], run["downscale"], run["placement"])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A strategy under a plan, and its differences from uniform pixels (dB)."""
+
+    psnr: float
+    spread: float | None
+    """The greater of its own and of uniform's; None: some scene has a single seed."""
+    differences: dict[str, float]
+    """By metric, over the trainings that uniform pixels have too; empty: none."""
+    pairs: list[float]
+    """Differences of PSNR, one a scene and seed."""
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Better or worse: by more than the spread. None: without a spread, or nothing to compare with."""
+        if self.spread is None or not self.differences:
+            return None
+        difference = self.differences["psnr"]
+        if abs(difference) <= self.spread:
+            return "same"
+        return "better" if difference > 0 else "worse"
+
+
+def panels_of(runs: Iterable[Run]) -> list[Panel]:
+    """Models in the order of `MODELS`, small before large, centered before shifted."""
+
+    def order(panel: Panel) -> tuple[Any, ...]:
+        return [*MODELS].index(panel.model), -panel.downscale, PLACEMENTS.index(panel.placement)
+
+    return sorted({Panel.of(run) for run in runs}, key=order)
+
+
+def strategies_of(runs: Iterable[Run]) -> list[str]:
+    """In the order of `STRATEGIES`, then those that this installation lacks."""
+    found = {run["strategy"] for run in runs}
+    return [name for name in STRATEGIES if name in found] + sorted(found - STRATEGIES.keys())
+
+
+def select(runs: Iterable[Run], panel: Panel, strategy: str, plan: str | None = None) -> list[Run]:
+    """The runs of a strategy in a panel, under one plan or under all."""
+    return [
+        run for run in runs if Panel.of(run) == panel and run["strategy"] == strategy and plan in (None, run["plan"])
+    ]
+
+
+def compare(runs: list[Run], panel: Panel, strategy: str, plan: str) -> Comparison | None:
+    """A strategy with uniform pixels; None: it has no run."""
+    own, uniform = select(runs, panel, strategy, plan), select(runs, panel, UNIFORM, plan)
+    if not own:
+        return None
+    pairs = _pair(own, uniform)
+    differences, spreads = {}, [_spread(own)]
+    if pairs and strategy != UNIFORM:
+        for metric in METRICS:
+            by_scene = _by_scene((run["scene"], run[metric] - before[metric]) for run, before in pairs)
+            differences[metric] = statistics.mean(map(statistics.median, by_scene.values()))
+        spreads.append(_spread([before for _, before in pairs]))
+    return Comparison(
+        psnr=statistics.mean(map(statistics.median, _by_scene((run["scene"], run["psnr"]) for run in own).values())),
+        spread=None if None in spreads else max(spread for spread in spreads if spread is not None),
+        differences=differences,
+        pairs=[run["psnr"] - before["psnr"] for run, before in pairs],
+    )
+
+
+def cost_of_a_step(runs: list[Run], panel: Panel, strategy: str) -> float | None:
+    """CPU seconds of a step as a multiple of uniform pixels': the median of the pairs of equal steps, if there are any;
+    what comes before the first step is left out."""
+    pairs = _pair(select(runs, panel, strategy, "steps"), select(runs, panel, UNIFORM, "steps"))
+    ratios = [_seconds_per_step(run) / _seconds_per_step(before) for run, before in pairs]
+    return statistics.median(ratios) if ratios else None
+
+
+def count_failures(runs: list[Run], panel: Panel, strategy: str) -> tuple[int, int]:
+    """Failures and trainings, under all plans."""
+    found = select(runs, panel, strategy)
+    return sum(map(failed, found)), len(found)
+
+
+def best_at_equal_seconds(runs: list[Run], panel: Panel) -> str | None:
+    """The strategy with the greatest difference from uniform pixels, uniform itself if none is above 0; None: nothing
+    was compared."""
+    found = {name: compare(runs, panel, name, "seconds") for name in strategies_of(runs)}
+    differences = {name: c.differences["psnr"] for name, c in found.items() if c is not None and c.differences}
+    if not differences:
+        return None
+    return max({UNIFORM: 0.0, **differences}.items(), key=lambda item: item[1])[0]
+
+
+def _seconds_per_step(run: Run) -> float:
+    return (run["seconds"] - run["ready_seconds"]) / run["steps"]
+
+
+def _pair(runs: Sequence[Run], uniform: Sequence[Run]) -> list[tuple[Run, Run]]:
+    """Runs of one panel and plan with uniform's of the same scene and seed."""
+    by_key = {(run["scene"], run["seed"]): run for run in uniform}
+    return [(run, by_key[key]) for run in runs if (key := (run["scene"], run["seed"])) in by_key]
+
+
+def _by_scene(values: Iterable[tuple[str, float]]) -> dict[str, list[float]]:
+    groups: dict[str, list[float]] = {}
+    for scene, value in values:
+        groups.setdefault(scene, []).append(value)
+    return groups
+
+
+def _spread(runs: Sequence[Run]) -> float | None:
+    """Of PSNR; None if some scene has a single seed."""
+    by_scene = _by_scene((run["scene"], run["psnr"]) for run in runs)
+    if any(len(psnrs) < 2 for psnrs in by_scene.values()):
+        return None
+    return statistics.mean(max(psnrs) - min(psnrs) for psnrs in by_scene.values())

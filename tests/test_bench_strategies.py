@@ -1,0 +1,299 @@
+"""Ways of choosing pixels on real scenes: what is trained, and that the page's numbers are those of the runs."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from dataclasses import asdict, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_se_sampler.bench.runner import new_result, write_result
+from edge_se_sampler.bench.strategies.claims import CLAIMS
+from edge_se_sampler.bench.strategies.command import BenchStrategies
+from edge_se_sampler.bench.strategies.report import describe, describe_use, draw, tables
+from edge_se_sampler.bench.strategies.summary import (
+    Panel,
+    best_at_equal_seconds,
+    compare,
+    cost_of_a_step,
+    count_failures,
+)
+from edge_se_sampler.bench.strategies.trials import (
+    DEFAULT,
+    MODELS,
+    PLANS,
+    STRATEGIES,
+    Length,
+    PlanName,
+    Settings,
+    Trial,
+    build_config,
+    read_views,
+    run_trial,
+    without_alpha,
+)
+from edge_se_sampler.data.synthetic.folder import make_scenes
+from edge_se_sampler.engine.config import MANAGER, MODEL
+from edge_se_sampler.engine.session import resolve_config
+from edge_se_sampler.errors import InputError
+from edge_se_sampler.methods import method_configs
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
+
+SHORT = Settings(nerf=Length(0.6, 12, 2), lean=Length(1, 30, 2))
+TRIAL = Trial("lean", "bricks", 1, "centered", "steps", "edge", 3)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scenes(tmp_path_factory.mktemp("scenes"), ("bricks",), size=24, num_train=6, num_val=1, num_test=3)[0]
+
+
+# -- what is trained
+
+
+@pytest.mark.parametrize(
+    ("model", "strategy"), [(m, name) for name, s in STRATEGIES.items() for m in s.models if m != "lean-no-masks"]
+)
+def test_every_strategy_can_be_trained_under_both_plans(model: str, strategy: str, scene: Path, tmp_path: Path) -> None:
+    for plan in ("seconds", "steps"):
+        trial = replace(TRIAL, model=model, strategy=strategy, plan=plan)
+        config = resolve_config(build_config(trial, SHORT, tmp_path), read_views(scene, 1, "train"))
+        sampler: Any = config.pipeline.datamanager.pixel_sampler
+        if strategy == DEFAULT:
+            assert sampler == method_configs()["lean-nerf"].pipeline.datamanager.pixel_sampler
+            continue
+        known = PIXEL_STRATEGIES.get(strategy)
+        expected: dict[str, Any] = dict(STRATEGIES[strategy].settings)
+        if known:
+            expected = {phase: strategy for phase in known.phases}
+        chosen = {"early": "uniform", "late": "uniform", **expected}
+        assert {name: getattr(sampler, name) for name in chosen} == chosen
+        assert sampler.early_steps == {"nerf": 1, "lean": 3}[model]
+
+
+@pytest.mark.parametrize("plan", PLANS)
+@pytest.mark.parametrize("model", ["nerf", "lean"])
+def test_a_training_lasts_as_long_as_its_plan(
+    model: str, plan: PlanName, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fast = {f"{MODEL}.width": 16, f"{MODEL}.num_coarse_samples": 8, f"{MODEL}.num_importance_samples": 4}
+    rays = {f"{MANAGER}.train_num_rays_per_batch": 64}
+    nerf = MODELS["nerf"]
+    monkeypatch.setitem(MODELS, "nerf", replace(nerf, changes={**nerf.changes, **fast, **rays}))
+    run = run_trial(replace(TRIAL, model=model, plan=plan), SHORT, scene)
+    length: Length = getattr(SHORT, model)
+    if plan == "steps":
+        assert run["steps"] == length.steps
+    else:
+        assert run["seconds"] == pytest.approx(length.seconds, abs=0.4)
+        assert run["steps"] != length.steps
+    assert 0 < run["ready_seconds"] < run["seconds"] < run["cpu_seconds"]
+    assert run["size"] == [24, 24]
+    assert len({run[name] for name in ("psnr", "foreground_psnr", "edge_band_psnr")}) == 3
+    assert 3 < run["psnr"] < 40
+    assert json.loads(json.dumps(run)) == run
+
+
+def test_without_masks_the_images_are_composited_on_white(scene: Path) -> None:
+    views = read_views(scene, 1, "train")
+    image = without_alpha(views).images[1]
+    alpha = views.images[1][..., 3:] / 255
+    assert (alpha < 1).any()
+    assert image.shape == (24, 24, 3)
+    np.testing.assert_allclose(image, views.images[1][..., :3] * alpha + 255 * (1 - alpha), atol=0.51)
+
+
+def test_masks_make_a_difference(scene: Path) -> None:
+    runs = [run_trial(replace(TRIAL, model=model), SHORT, scene) for model in ("lean", "lean-no-masks")]
+    assert runs[0]["psnr"] > runs[1]["psnr"]
+
+
+def test_what_is_compared_is_trained_side_by_side(tmp_path: Path) -> None:
+    for scene in ("lego", "chair"):
+        (tmp_path / scene).mkdir()
+    command = BenchStrategies(
+        output_dir=tmp_path,
+        scenes_dir=tmp_path,
+        models=("nerf", "lean"),
+        strategies=("edge", DEFAULT),
+        plans=("steps",),
+    )
+    experiment = command.experiment()
+    trials = experiment.trials([])
+    first = Trial("nerf", "lego", 8, "centered", "steps", "edge", 0)
+    assert trials[:2] == [first, replace(first, scene="chair")]  # NeRF has no default of lean-nerf
+    assert len(trials) == 3 * 2 * 2 * 2 * (1 + 2)
+    assert experiment.arguments(first) == (Settings(), tmp_path / "lego")
+
+
+def test_an_off_center_copy_is_made_once(scene: Path, tmp_path: Path) -> None:
+    command = BenchStrategies(
+        output_dir=tmp_path, scenes_dir=scene.parent, scenes=("bricks",), workplace=tmp_path, placements=("shifted",)
+    )
+    experiment = command.experiment()
+    trial = experiment.trials([])[0]
+    _, folder = experiment.arguments(trial)
+    made = (folder / "transforms_train.json").stat().st_mtime_ns
+    assert experiment.arguments(trial)[1] == folder
+    assert (folder / "transforms_train.json").stat().st_mtime_ns == made
+    assert read_views(folder, 1, "train").images[0].shape[:2] == (24 + 2 * 4, 24 + 2 * 5)
+
+
+def test_bad_flags_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "lego").mkdir()
+    flags: Any = {"output_dir": tmp_path, "scenes_dir": tmp_path, "scenes": ("lego",)}
+    for bad in ({"strategies": ("none",)}, {"downscales": (0,)}, {"scenes": ("chair",)}):
+        with pytest.raises(InputError):
+            BenchStrategies(**flags | bad).experiment()
+
+
+# -- what the runs say
+
+
+def run_of(psnr: float, seed: int, strategy: str = "uniform", **more: Any) -> dict[str, Any]:
+    trial = Trial("lean", "lego", 4, "centered", "seconds", strategy, seed)
+    measured = {
+        "size": [200, 200], "psnr": psnr, "foreground_psnr": psnr - 5, "edge_band_psnr": psnr - 7, "steps": 100,
+        "seconds": 10.0, "ready_seconds": 1.0, "cpu_seconds": 12.0, "outcome": "converged",
+    }  # fmt: skip
+    return {**asdict(trial), **measured, **more}
+
+
+def folder_of(folder: Path, runs: list[dict[str, Any]], errors: tuple[dict[str, Any], ...] = ()) -> Path:
+    result = new_result("strategies", asdict(Settings())) | {"errors": list(errors), "runs": runs}
+    write_result(folder / "result.json", json.loads(json.dumps(result)))
+    return folder
+
+
+PANEL = Panel("lean", 4, "centered")
+
+
+def random_runs() -> list[dict[str, Any]]:
+    """Three strategies, of which `edge` lacks a seed on chair."""
+    rng = np.random.default_rng(0)
+    return [
+        run_of(
+            rng.normal(25, 1), seed, strategy, scene=scene, plan=plan, placement=placement,
+            foreground_psnr=rng.normal(20, 1), edge_band_psnr=rng.normal(18, 1), seconds=rng.uniform(8, 12),
+            steps=int(rng.integers(100, 200)), outcome=rng.choice(["converged", "collapsed", "underfit"]),
+        )
+        for strategy, scene, plan, placement, seed in product(
+            ("uniform", "edge", "se-cached"), ("lego", "chair"), ("seconds", "steps"), ("centered", "shifted"), range(4)
+        )
+        if (strategy, scene, seed) != ("edge", "chair", 2)
+    ]  # fmt: skip
+
+
+def test_numbers_are_those_of_brute_force() -> None:
+    runs = random_runs()
+
+    def at(strategy: str, scene: str, plan: str, seed: int) -> dict[str, Any]:
+        key = {"strategy": strategy, "scene": scene, "plan": plan, "seed": seed, "placement": "centered"}
+        return next(run for run in runs if key.items() <= run.items())
+
+    seeds = {"lego": (0, 1, 2, 3), "chair": (0, 1, 3)}
+    for plan in ("seconds", "steps"):
+        found = compare(runs, PANEL, "edge", plan)
+        assert found is not None
+        psnrs = {scene: [at("edge", scene, plan, seed)["psnr"] for seed in seeds[scene]] for scene in seeds}
+        before = {scene: [at("uniform", scene, plan, seed)["psnr"] for seed in seeds[scene]] for scene in seeds}
+        assert found.psnr == pytest.approx((np.median(psnrs["lego"]) + np.median(psnrs["chair"])) / 2)
+        spreads = [np.mean([np.ptp(values) for values in of_seeds.values()]) for of_seeds in (psnrs, before)]
+        assert found.spread == pytest.approx(max(spreads))
+        for metric in ("psnr", "foreground_psnr", "edge_band_psnr"):
+            medians = [
+                np.median([at("edge", s, plan, i)[metric] - at("uniform", s, plan, i)[metric] for i in seeds[s]])
+                for s in seeds
+            ]
+            assert found.differences[metric] == pytest.approx(sum(medians) / 2)
+        assert len(found.pairs) == 7
+    ratios = []
+    for scene, numbers in seeds.items():
+        for seed in numbers:
+            edge, uniform = (at(strategy, scene, "steps", seed) for strategy in ("edge", "uniform"))
+            ratios.append((edge["seconds"] - 1) / edge["steps"] / ((uniform["seconds"] - 1) / uniform["steps"]))
+    assert cost_of_a_step(runs, PANEL, "edge") == pytest.approx(statistics.median(ratios))
+    outcomes = [run["outcome"] for run in runs if run["strategy"] == "edge" and run["placement"] == "centered"]
+    assert count_failures(runs, PANEL, "edge") == (14 - outcomes.count("converged"), 14)
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "verdict", "use"),
+    [
+        ((27.0, 27.1, 27.2), "better", "yes, better: lean, 200 px"),
+        ((25.4, 25.5, 25.3), "same", "no need, not distinguishable in 1 of 1"),
+        ((26.0, 26.1, 26.2), "same", "no need, not distinguishable in 1 of 1"),  # so does that of uniform
+        ((23.0, 23.1, 23.2), "worse", "no, worse: lean, 200 px"),
+        ((29.0,), None, "no verdict (one seed) in 1 of 1"),
+        ((24.0, 27.0, 27.1), "same", "no need, not distinguishable in 1 of 1"),  # its own spread counts
+    ],
+)
+def test_a_verdict_needs_more_than_the_spread_of_seeds(psnrs: tuple[float, ...], verdict: str | None, use: str) -> None:
+    runs = [run_of(psnr, seed) for seed, psnr in enumerate((25.0, 25.3, 26.0)[: len(psnrs)])]
+    runs += [run_of(psnr, seed, "edge") for seed, psnr in enumerate(psnrs)]
+    found = compare(runs, PANEL, "edge", "seconds")
+    assert found is not None
+    assert found.verdict == verdict
+    assert describe_use(runs, "edge") == use
+    assert best_at_equal_seconds(runs, PANEL) == ("uniform" if verdict == "worse" else "edge")
+
+
+def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
+    runs = []
+    for downscale, offsets in ((4, (2, 2)), (8, (-2, -2)), (16, (0, 0)), (2, (2,))):
+        for seed, offset in enumerate(offsets):
+            more = {"downscale": downscale, "size": [800 // downscale] * 2}
+            runs += [run_of(25 + seed / 10, seed, **more), run_of(25 + offset, seed, "edge", **more)]
+    expected = "yes, better: lean, 200 px; worse: lean, 100 px; not distinguishable in 1 of 4"
+    assert describe_use(runs, "edge") == f"{expected}; no verdict (one seed) in 1 of 4"
+    less = [run for run in runs if run["downscale"] >= 8]
+    assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable in 1 of 2"
+    assert describe_use(less, "se") == "–"
+
+
+def test_uniform_pixels_are_compared_with_nothing() -> None:
+    runs = [run_of(25.0, 0), run_of(26.0, 1), run_of(24.0, 0, "edge", scene="chair")]
+    uniform, edge = (compare(runs, PANEL, name, "seconds") for name in ("uniform", "edge"))
+    assert uniform is not None
+    assert (uniform.spread, uniform.differences, uniform.verdict) == (1.0, {}, None)
+    assert edge is not None
+    assert (edge.differences, edge.pairs) == ({}, [])  # uniform pixels have no training on that scene
+    assert compare(runs, PANEL, "se", "seconds") is None
+    assert best_at_equal_seconds(runs, PANEL) is None
+
+
+def test_the_page_shows_the_numbers(tmp_path: Path) -> None:
+    runs = [run_of(psnr, seed) for seed, psnr in enumerate((25.0, 25.2))]
+    runs += [run_of(psnr, seed, "edge") for seed, psnr in enumerate((26.0, 26.4))]
+    runs += [run_of(psnr, seed, "edge", plan="steps", seconds=7.0) for seed, psnr in enumerate((25.0, 25.1))]
+    runs += [run_of(25.0, seed, plan="steps", seconds=4.0, outcome="collapsed") for seed in range(2)]
+    page = describe(folder_of(tmp_path, runs, ({"model": "lean", "error": "broken"},)))
+    assert "### lean, 200 px\n" in page
+    edge = next(line for line in page.splitlines() if line.startswith("| edge | 26.20"))
+    assert edge == (
+        "| edge | 26.20 (0.40) | **+1.10** | +1.10 | +1.10 | 25.05 (0.10) | +0.05 | +0.05 | +0.05 | x2.00 | 0 of 4 |"
+    )
+    assert "| uniform | 25.10 (0.20) | – | – | – | 25.00 (0.00) | – | – | – | x1.00 | 2 of 4 |" in page
+    assert "| lean, 200 px | edge | +1.10 | better | – | – |" in page
+    assert "| lean +1.10, a step x2.00 | yes, better: lean, 200 px |" in tables(tmp_path)["strategies"]
+    assert "broken" in page
+    assert "10 s or 800 steps" in page
+    assert "ended in an error" not in describe(folder_of(tmp_path, runs))
+
+
+def test_the_picture_has_a_part_for_every_panel(tmp_path: Path) -> None:
+    draw(folder_of(tmp_path, [run_of(25.0, 0)]), None)
+    assert not (tmp_path / "chart.png").exists()  # nothing to compare
+    draw(folder_of(tmp_path, random_runs()), None)
+    assert "chart.png" in describe(tmp_path)
+
+
+def test_claims_are_of_strategies_by_their_names() -> None:
+    assert not {*PIXEL_STRATEGIES} - {*CLAIMS} - {"uniform"}
+    assert not {DEFAULT, "uniform"} & {*CLAIMS}
+    assert {*MODELS} == {"nerf", "lean", "lean-no-masks"}

@@ -1,0 +1,237 @@
+"""A disk that is full, or becomes read-only at any write: one line, exit code 2, and what was there is whole."""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import os
+import random
+import subprocess
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from killable import toy_experiment
+from test_killed import flat, metrics_of, state_of
+from tiny import SMALL
+
+from edge_se_sampler.bench.runner import read_result, run_experiment
+from edge_se_sampler.errors import InputError
+
+SOME, ALL = 4, pytest.param(None, marks=pytest.mark.slow)
+
+
+class FailingDisk:
+    """Counts what is written below a folder, and lets all but the first `allowed` writes fail; None: none fails."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.folder, self.code, self.count, self.allowed = folder, errno.ENOSPC, 0, None
+        opened, system = builtins.open, {name: getattr(os, name) for name in ("mkdir", "replace", "fsync")}
+
+        def open_and_watch(path: Any, mode: str = "r", *arguments: Any, **keywords: Any) -> Any:
+            is_written = isinstance(path, str | os.PathLike) and set(mode) & set("wax") and self._is_below(path)
+            if is_written:
+                self._write()
+            file = opened(path, mode, *arguments, **keywords)
+            return WatchedFile(file, self._write) if is_written else file
+
+        def watched(name: str) -> Callable[..., Any]:
+            def call(path: Any, *arguments: Any, **keywords: Any) -> Any:
+                if name == "fsync" or self._is_below(path):
+                    self._write()
+                return system[name](path, *arguments, **keywords)
+
+            return call
+
+        monkeypatch.setattr(builtins, "open", open_and_watch)
+        for name in system:
+            monkeypatch.setattr(os, name, watched(name))
+
+    def fail_after(self, allowed: int | None, code: int = errno.ENOSPC) -> None:
+        self.count, self.allowed, self.code = 0, allowed, code
+
+    def _is_below(self, path: Any) -> bool:
+        return Path(os.fspath(path)).resolve().is_relative_to(self.folder)
+
+    def _write(self) -> None:
+        self.count += 1
+        if self.allowed is not None and self.count > self.allowed:
+            raise OSError(self.code, os.strerror(self.code))
+
+
+class WatchedFile:
+    """A file whose writes are counted; half of one that fails is written."""
+
+    def __init__(self, file: Any, before_write: Callable[[], None]) -> None:
+        self._file, self._before_write = file, before_write
+
+    def __enter__(self) -> WatchedFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def write(self, data: Any) -> int:
+        try:
+            self._before_write()
+        except OSError:
+            self._file.write(data[: len(data) // 2])
+            raise
+        return self._file.write(data)
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FailingDisk:
+    return FailingDisk(monkeypatch, tmp_path / "disk")
+
+
+def moments(count: int, some: int | None) -> list[int]:
+    """All of a number of moments, or some of them."""
+    return list(range(count)) if some is None else sorted(random.Random(0).sample(range(count), some))
+
+
+def train_flags(scene: Path, output_dir: Path) -> list[object]:
+    rest = ("--steps-per-save", 2, "--steps-per-eval-image", 3, "--pipeline.model.width", 8)
+    return ["train", "edge-se-nerf", "--data", scene, *SMALL, *rest, "--output-dir", output_dir]
+
+
+@pytest.mark.parametrize("some", [SOME, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_training_goes_on_once_there_is_room(
+    some: int | None, scene: Path, tmp_path: Path, edge_se, disk: FailingDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edge_se_sampler.engine.run_folder.find_spec", lambda name: None)  # TensorBoard has threads
+    assert edge_se(*train_flags(scene, tmp_path / "disk" / "whole")).code == 0
+    whole, resumed = next(tmp_path.glob("disk/whole/*/*/*")), 0
+    disk_writes = disk.count
+    for number in moments(disk_writes, some):
+        parts = tmp_path / "disk" / f"{number}"
+        disk.fail_after(number, [errno.ENOSPC, errno.EROFS, errno.EIO][number % 3])
+        answer = edge_se(*train_flags(scene, parts))
+        assert (answer.code, answer.err.count("\n")) == (2, 1), (number, answer.err)
+        disk.fail_after(None)
+        assert all((path / "config.json").exists() for path in parts.glob("*/*/*"))
+        saved = [path.parents[1] for path in parts.glob("*/*/*/checkpoints/*.ckpt")]
+        if not saved:
+            continue
+        resumed += 1
+        state_of(saved[0])
+        assert "takes its place" not in (answer := edge_se("resume", saved[0])).err
+        assert answer.code == 0, (number, answer.err)
+        assert flat(state_of(saved[0])) == flat(state_of(whole))
+        assert metrics_of(saved[0]) == metrics_of(whole)
+    print(f"{disk_writes} writes, {resumed} resumed")
+
+
+@pytest.mark.parametrize("some", [2, ALL])
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("eval", "--output-path", "eval.json", "--render-output-path", "views"),
+        ("render", "--num-frames", "2", "--output-path", "turn.gif"),
+        ("render", "--num-frames", "2", "--outputs", "rgb", "--output-path", "frames"),
+        ("export", "cameras", "--output-path", "cameras.json"),
+        ("export", "points", "--num-points", "50", "--output-path", "points.ply"),
+        ("resume", "--max-num-iterations", "9"),
+    ],
+    ids=" ".join,
+)
+def test_commands_on_a_run_leave_what_was_there(
+    flags: tuple[str, ...], some: int | None, run: Path, tmp_path: Path, edge_se, disk: FailingDisk
+) -> None:
+    if "points" in flags:
+        pytest.importorskip("scipy")
+    (tmp_path / "disk").mkdir()
+    run = run.rename(tmp_path / "disk" / "run")
+    files = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    state = flat(state_of(run))
+    command, *rest = (
+        tmp_path / "disk" / flag if "." in flag or flag in ("views", "frames") else flag for flag in flags
+    )
+    disk.fail_after(0)
+    number = 0
+    while (answer := edge_se(command, run, *rest)).code:
+        assert (answer.code, answer.err.count("\n")) == (2, 1), (number, answer.err)
+        if command != "resume":
+            assert files == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+        else:
+            assert state_of(run)["step"] >= state["step"]
+        number = number + 1 + number // (10 if some is None else 1) * 2
+        disk.fail_after(number, [errno.ENOSPC, errno.EROFS, errno.EIO][number % 3])
+    disk.fail_after(None)
+    assert not list(tmp_path.rglob("*.tmp"))
+    print(f"{number} writes")
+
+
+@pytest.mark.parametrize("some", [4, ALL])
+def test_finished_trials_of_a_bench_stay(some: int | None, tmp_path: Path, disk: FailingDisk) -> None:
+    def run(folder: Path) -> None:
+        run_experiment(toy_experiment(), folder, lambda: ThreadPoolExecutor(1))
+
+    run(tmp_path / "disk" / "whole")
+    whole = read_result(tmp_path / "disk" / "whole" / "result.json")["runs"]
+    for number in moments(disk.count, some):
+        folder = tmp_path / "disk" / f"{number}"
+        disk.fail_after(number)
+        with pytest.raises(InputError, match="disk"):
+            run(folder)
+        disk.fail_after(None)
+        if (folder / "result.json").exists():
+            found = read_result(folder / "result.json")["runs"]
+            assert found == whole[: len(found)]
+        run(folder)
+        assert read_result(folder / "result.json")["runs"] == whole
+
+
+@pytest.fixture
+def tmpfs(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """Mounts a file system of so many bytes."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mounted = []
+
+    def mount(size: int) -> Path:
+        while mounted:
+            subprocess.run(["umount", mounted.pop()], check=True)
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+        if subprocess.run(command, capture_output=True).returncode:
+            pytest.skip("file systems cannot be mounted here")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for path in mounted:
+        subprocess.run(["umount", path], check=True)
+
+
+@pytest.mark.parametrize("kilobytes", [16, 80])
+def test_a_small_file_system_is_filled(kilobytes: int, scene: Path, tmp_path: Path, edge_se, tmpfs) -> None:
+    folder = tmpfs(2**10 * kilobytes)
+    assert edge_se(*train_flags(scene, tmp_path / "whole")).code == 0
+    whole = next(tmp_path.glob("whole/*/*/*"))
+    answer = edge_se(*train_flags(scene, folder))
+    assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
+    saved = [path.parents[1] for path in folder.glob("*/*/*/checkpoints/*.ckpt")]
+    assert (len(saved) > 0) == (kilobytes > 16)
+    if saved:
+        before = state_of(saved[0])["step"]
+        subprocess.run(["mount", "-o", "remount,size=16m", folder], check=True)
+        assert edge_se("resume", saved[0]).code == 0
+        assert before < state_of(saved[0])["step"]
+        assert flat(state_of(saved[0])) == flat(state_of(whole))
+
+
+def test_a_file_system_that_becomes_read_only(scene: Path, edge_se, tmpfs) -> None:
+    folder = tmpfs(2**24)
+    assert edge_se(*train_flags(scene, folder)).code == 0
+    run = next(folder.glob("*/*/*"))
+    state = flat(state_of(run))
+    subprocess.run(["mount", "-o", "remount,ro", folder], check=True)
+    for command in (["resume", run, "--max-num-iterations", 9], ["eval", run, "--output-path", folder / "e.json"]):
+        answer = edge_se(*command)
+        assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
+        assert flat(state_of(run)) == state
