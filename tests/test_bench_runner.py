@@ -182,7 +182,7 @@ def test_shards_train_each_trial_once_and_are_put_together(tmp_path: Path, monke
     (tmp_path / "shards" / "1-of-2.json").rename(tmp_path / "shards" / "of_another_machine.json")
     monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy"])
     result = run_experiment(toy_experiment(lambda _: pytest.fail("trained")), tmp_path, one_thread)
-    assert read(tmp_path) == json.loads(json.dumps(result))
+    assert read_result(tmp_path / "result.json") == json.loads(json.dumps(result))
     assert [run["psnr"] for run in result["runs"]] == [20.0, 21.0, 22.0]
     commands = ["edge-se bench toy --shard 1/2", "edge-se bench toy --shard 2/2", "edge-se bench toy"]
     assert sorted(result["command"].splitlines()) == sorted(commands)

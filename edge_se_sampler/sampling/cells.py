@@ -161,6 +161,9 @@ class CellTable:
         else:
             which = (u[0] * len(indices)).astype(np.int64)
         block = np.searchsorted(self._cumulative[1:], low[which] + u[1] * mass[which], side="right")
+        first, end = self._first_block[indices[which]], self._first_block[indices[which] + 1]
+        for i in np.flatnonzero((block < first) | (block >= end)):  # rounding: other images have much larger values
+            block[i] = first[i] + self._mass[first[i] : end[i]].argmax()
         weights = self._weights(block).cumsum(axis=1)
         cell = BLOCK * block + (weights <= (u[2] * weights[:, -1])[:, None]).sum(axis=1)
         row, column = self._draw_in_cells(indices[which], cell, rng)
