@@ -89,6 +89,7 @@ def test_a_checkpoint_of_another_grid_or_weights(attack: str, lean: Path, refuse
 
 TRAININGS = {
     "moments of another shape": lambda state: state["optimizer"]["state"][0].update(exp_avg=torch.zeros(1)),
+    "moments of a step below 0": lambda state: state["optimizer"]["state"][0]["step"].fill_(-1),
     "moments of an unknown weight": lambda state: state["optimizer"]["state"].update({99: {}}),
     "an optimizer of other settings": lambda state: state["optimizer"]["param_groups"][0].update(capturable=True),
     "a group without epsilon": lambda state: state["optimizer"]["param_groups"][0].pop("eps"),
@@ -155,6 +156,7 @@ SETTINGS = {
     "views that are texts": ("views", [["x"]]),
     "a path with a zero byte": ("data", "a\0b"),
     "a text of 10^6 characters": ("machine.seed", "x" * 10**6),
+    "a budget of two lines": ("time_budget", "1\n2"),
     "an endless budget": ("time_budget", "9" * 400),
 }
 

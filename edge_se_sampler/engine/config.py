@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import tyro
 
 from edge_se_sampler.data.config import DataFormat, Masks, VanillaDataManagerConfig
+from edge_se_sampler.data.scene_file import quote
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.config import (
     INFINITY,
@@ -128,7 +129,7 @@ class TrainerConfig(InstantiateConfig):
             return None
         match = re.fullmatch(r"(\d+(?:\.\d*)?) *([smh]?)", self.time_budget.strip())
         seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
-        check_value("time-budget", self.time_budget, 0 < seconds < INFINITY, "seconds above 0, or 10m, or 1h")
+        check_value("time-budget", quote(self.time_budget), 0 < seconds < INFINITY, "seconds above 0, or 10m, or 1h")
         return seconds
 
     @property

@@ -182,4 +182,5 @@ def _are_moments(moments: Any, weight: Tensor) -> bool:
         and mean.shape == weight.shape
         and square.shape in shapes
         and steps.shape == ()
+        and 0 <= float(steps) < MAX_STEP
     )

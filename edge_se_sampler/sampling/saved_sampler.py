@@ -104,7 +104,8 @@ def _is_forest(state: Any, own: Mapping[str, Any], images: Sizes) -> bool:
 
 
 def is_alike(found: Any, own: Any) -> bool:
-    """Whether a value is of another's kind: dicts have the same keys, tensors the same shape, numbers are finite."""
+    """Whether a value is of another's kind: dicts have the same keys, tensors the same shape, numbers are finite,
+    and whole where the other is."""
     if isinstance(own, dict):
         same = isinstance(found, dict) and found.keys() == own.keys()
         return same and all(is_alike(found[key], own[key]) for key in own)
@@ -116,8 +117,10 @@ def is_alike(found: Any, own: Any) -> bool:
         return isinstance(found, Tensor) and (found.dtype, found.shape) == (own.dtype, own.shape)
     if isinstance(own, str):
         return found in ("early", "late")  # of phases alone
-    if isinstance(own, (int, float)):
-        return type(found) is bool if type(own) is bool else is_finite(found)
+    if isinstance(own, float):
+        return is_finite(found)
+    if isinstance(own, int):
+        return type(found) is type(own) and is_finite(int(found))
     return found is None and own is None
 
 
