@@ -14,8 +14,10 @@ from strangers import memory_bound
 from edge_se_sampler.engine.saved_state import check_tensors
 from edge_se_sampler.sampling import actray, instant_ngp
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
-from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, PixelStrategy
 from edge_se_sampler.sampling.saved_sampler import is_sampler_state
+from edge_se_sampler.sampling.settings import SamplingSettings
+from edge_se_sampler.sampling.strategies import Uniform
 
 IMAGES = dict(zip(NUMBERS, MIXED, strict=True))
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -75,3 +77,29 @@ def test_any_change_is_drawn_from_or_refused(kind: str) -> None:
             if valid:
                 other.load_state_dict(state)
                 learn(other, 4)
+
+
+class Counting(Uniform):
+    """Another package's, whose state grows."""
+
+    def __init__(self, settings: SamplingSettings) -> None:
+        super().__init__(settings)
+        self.seen: dict[Any, Any] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        return dict(self.seen)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.seen = dict(state)
+
+
+def test_other_packages_judge_their_own_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PIXEL_STRATEGIES, "counting", PixelStrategy(Counting, ("late",), ""))
+    sampler = following(500, late="counting", early="uniform", early_fraction=0.0)
+    for valid, state in (
+        (True, {}),
+        (True, {"counting.distribution": {7: 3, 11: "many"}}),
+        (False, {"counts.distribution": {}}),
+        (False, {"uniform.distribution": {7: 3}}),
+    ):
+        assert is_sampler_state(state, sampler, IMAGES) == valid
