@@ -26,6 +26,12 @@ def scene(_rendered_scene: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(_rendered_scene, tmp_path / "scene"))
 
 
+@pytest.fixture(scope="session")
+def stranger_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs of both kinds of model, stopped after a step, to be copied and spoiled."""
+    return pytest.importorskip("strangers").make_runs(tmp_path_factory.mktemp("strangers"))
+
+
 @dataclass(frozen=True)
 class Answer:
     code: int

@@ -80,7 +80,9 @@ def ball_run(folder: Path, scale: float = 1.0, size: int = 48, empty: bool = Fal
     config = override(method_configs()["lean-nerf"], changes | {"machine.device_type": "cpu"})
     config = resolve_config(config, read_blender(data, "train"))
     run = RunFolder.create(config)
-    save_checkpoint(run.checkpoints, 0, {"config_digest": config_digest(config), "model": model.state_dict()})
+    state = {"config_digest": config_digest(config), "model": model.state_dict(), "step": 0, "elapsed": 0.0}
+    state |= {"plan": {}, "scheduler": {}, "sampler": {}, "optimizer": None, "dead_network_reset": None}
+    save_checkpoint(run.checkpoints, 0, state)
     return run.path
 
 

@@ -3,7 +3,6 @@ are written with: templates, Markdown tables, numbers, commands and machines."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -12,6 +11,7 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
+from edge_se_sampler.data.scene_file import quote, read_json
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
@@ -25,8 +25,8 @@ def report_of(folder: Path) -> Any:
     the workplace has them; `tables(folder)` are tables by name that other texts show. All raise InputError if the
     result cannot be read or a picture cannot be written, and so does this if no result lies there."""
     for path in sorted(folder.glob("**/*.json")):
-        with suppress(OSError, ValueError, TypeError, KeyError):
-            name = json.loads(path.read_text(encoding="utf-8"))["experiment"]
+        with suppress(InputError):
+            name = read_json(path).object().get("experiment")
             if name in REPORTS:
                 break
     else:
@@ -38,11 +38,19 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
     """Write a folder's pictures (of renderings in the workplace) and README.md, and fill its tables into another text.
     InputError: no result lies there, matplotlib is missing, or a file cannot be written."""
     report = report_of(folder)
-    if hasattr(report, "draw"):
-        report.draw(folder, workplace)
-    write_atomically(folder / "README.md", report.describe(folder).encode())
+    try:
+        if hasattr(report, "draw"):
+            report.describe(folder)  # what cannot be described is not drawn either
+            report.draw(folder, workplace)
+        text = report.describe(folder)
+        tables = report.tables(folder) if readme is not None and hasattr(report, "tables") else {}
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as problem:
+        if isinstance(problem, InputError):
+            raise
+        raise InputError(f"{folder}: its result is none of edge-se bench ({quote(problem)})") from problem
+    write_atomically(folder / "README.md", text.encode())
     if readme is not None:
-        _fill_markers(readme, report.tables(folder) if hasattr(report, "tables") else {})
+        _fill_markers(readme, tables)
 
 
 def _fill_markers(path: Path, tables: Mapping[str, str]) -> None:

@@ -23,12 +23,15 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.machine import machine
+from edge_se_sampler.data.scene_file import quote, read_json
 from edge_se_sampler.engine.files import checksum, make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError, check_value
 
 VERSION = 3
 """Of results. Version 2, which is read as well, has no checksum."""
+PLAIN = re.compile(r"[\w .,:;=+/()%'\"~@-]*")
+"""Texts without marks of Markdown and HTML."""
 MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
@@ -152,9 +155,9 @@ def _command() -> str:
 def read_result(path: Path) -> dict[str, Any]:
     """A result.json; InputError if it cannot be read, is no result of this version or the one before, or is not as it
     was written."""
+    result = read_json(path).object()
+    claimed = result.pop("checksum", None)
     try:
-        result = json.loads(path.read_text(encoding="utf-8"))
-        claimed = result.pop("checksum", None)
         if result["version"] not in (2, VERSION):
             raise ValueError(f"version {result['version']}, not {VERSION}")
         if claimed != (None if result["version"] == 2 else checksum(result)):
@@ -163,9 +166,28 @@ def read_result(path: Path) -> dict[str, Any]:
             raise KeyError("experiment, command, settings or machine")
         if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
             raise TypeError("runs and errors are lists of objects")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
-        raise InputError(f"{path}: not a result of edge-se bench ({problem!r})") from problem
+        check_texts(result)
+    except (ValueError, KeyError, TypeError, RecursionError) as problem:
+        raise InputError(f"{path}: not a result of edge-se bench ({quote(problem)})") from problem
     return result
+
+
+def check_texts(result: dict[str, Any]) -> None:
+    """ValueError or TypeError if a result's texts could be more than that in a page, see `check_plain`."""
+    check_plain({key: value for key, value in result.items() if key not in ("errors", "command")})
+    check_plain([line.replace("..", "") for line in str(result["command"]).splitlines()])  # paths of one's own
+
+
+def check_plain(value: Any) -> None:
+    """ValueError if a text in a json value could be more than text in a page or the name of a file: HTML, a link, a
+    path that leads out."""
+    if isinstance(value, dict):
+        check_plain([*value, *value.values()])
+    elif isinstance(value, list):
+        for item in value:
+            check_plain(item)
+    elif isinstance(value, str) and (".." in value or not PLAIN.fullmatch(value)):
+        raise ValueError(f"a text with marks: {quote(value)}")
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:

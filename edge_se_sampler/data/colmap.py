@@ -55,6 +55,7 @@ def find_images(folder: Path) -> Path:
     """The first of FOLDERS that there is; InputError if there is none."""
     for name in FOLDERS:
         if (folder / name).is_dir():
+            locate_file(folder, name, SourceLocation(folder))
             return folder / name
     raise SourceLocation(folder).error("has no images", f"put them into {', '.join(FOLDERS[:-1])} or {FOLDERS[-1]}")
 

@@ -24,6 +24,8 @@ from edge_se_sampler.errors import InputError
 
 Progress = Callable[[int, int], None]
 """Called with the number of images read so far, and of all."""
+MAX_MISFIT = 2**22
+"""Pixels of a mask of another size than its image, up to which it is decoded: it may be damaged, too."""
 MAX_REMAPPED = 2**15 - 2
 """Pixels, of a side: OpenCV undistorts no larger images."""
 MIN_FOCAL, MAX_FOCAL = 0.01, 1e4
@@ -190,15 +192,18 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8: the largest color of the pixels of an image's mask, which is turned as its own orientation says if
     that gives it the image's size."""
-    height, width = image.shape[:2]
+    height, width = size = image.shape[:2]
     header = choose_orientation(
         file, read_header(file), lambda header: (header.width, header.height) == (width, height)
     )
-    colors = turn_upright(read_image(file), header.orientation)[..., :3]  # without alpha: an opaque black mask masks
-    if colors.shape[:2] != (height, width):
-        problem = f"is {colors.shape[1]} x {colors.shape[0]} pixels, its image {width} x {height}"
-        raise file.error(problem, "give the mask the size of its image")
-    return colors.max(axis=2)
+    found = header.height, header.width
+    if found == size or header.height * header.width <= MAX_MISFIT:
+        colors = turn_upright(read_image(file), header.orientation)[..., :3]  # without alpha: an opaque black one masks
+        found = colors.shape[:2]
+        if found == size:
+            return colors.max(axis=2)
+    problem = f"is {found[1]} x {found[0]} pixels, its image {width} x {height}"
+    raise file.error(problem, "give the mask the size of its image")
 
 
 def _cameras(frames: Sequence[Frame], downscale: int) -> Cameras:

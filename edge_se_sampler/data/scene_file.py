@@ -110,6 +110,10 @@ def check_listed_once(files: Iterable[SourceFile]) -> None:
             raise file.error(f"is already the image of {other.location.field}", "list every image once")
 
 
+MAX_JSON = 2**27
+"""Bytes of a file: 100,000 cameras."""
+
+
 @dataclass(frozen=True)
 class JsonValue:
     """A json value and its location. All methods raise InputError, which names the location, for other values."""
@@ -174,6 +178,8 @@ class JsonValue:
 def read_json(path: Path) -> JsonValue:
     """The json object that a file holds; InputError if the file cannot be read or holds anything else."""
     location = SourceLocation(path)
+    if path.is_file() and path.stat().st_size > MAX_JSON:
+        raise location.error(f"has more than {MAX_JSON >> 20} MiB", "a json of cameras or settings is expected")
     data = SourceFile(path, location).read_bytes()
     try:
         value = json.loads(data.decode("utf-8-sig"))  # a byte order mark, which Windows editors add, does no harm
@@ -197,10 +203,21 @@ def _check_finite(top: JsonValue) -> None:
     pending = [top]  # not recursive: the nesting may be deeper than Python's stack
     while pending:
         entry = pending.pop()
-        if isinstance(entry.value, dict):
-            pending += [JsonValue(item, entry.location.member(key)) for key, item in entry.value.items()]
-        elif isinstance(entry.value, list):
-            pending += entry.list()
-        elif isinstance(entry.value, float) and not math.isfinite(entry.value):
+        if _is_infinite(entry.value):
             problem = "is NaN, Infinity or too large a number"
             raise entry.location.error(problem, "every number in the file must be finite")
+        # other values have no location made for them: of millions, these would take memory
+        if isinstance(entry.value, dict):
+            items = entry.value.items()
+            pending += [JsonValue(item, entry.location.member(key)) for key, item in items if _is_looked_into(item)]
+        elif isinstance(entry.value, list):
+            items = enumerate(entry.value)
+            pending += [JsonValue(item, entry.location.item(i)) for i, item in items if _is_looked_into(item)]
+
+
+def _is_looked_into(value: Any) -> bool:
+    return isinstance(value, (dict, list)) or _is_infinite(value)
+
+
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)

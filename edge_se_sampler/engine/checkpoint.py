@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import io
-import pickle
 import sys
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.engine.files import write_atomically
+from edge_se_sampler.engine.saved_state import check_archive, check_tensors
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 MAGIC = b"edge-se-checkpoint 3 "
@@ -101,12 +102,12 @@ def load_latest(folder: Path, config_digest: str) -> tuple[Path, dict[str, Any]]
 
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
-    """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle or was saved
-    under another configuration."""
+    """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle, is none, or
+    was saved under another configuration."""
     try:
-        content = path.read_bytes()
-    except OSError as problem:
-        raise DamagedCheckpoint(f"{path}: cannot be read ({problem.strerror})") from problem
+        content = SourceFile(path, SourceLocation(path)).read_bytes()
+    except InputError as problem:
+        raise DamagedCheckpoint(str(problem)) from problem
     header, _, payload = content.partition(b"\n")
     magic = header[: len(MAGIC)]
     if magic not in (MAGIC, MAGIC_2):
@@ -116,11 +117,18 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     if header[len(MAGIC) :] != digest.hexdigest().encode():
         raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
     try:
+        check_archive(payload)
         state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as problem:
+    except MemoryError:
+        raise
+    except Exception as problem:  # whatever a pickle that was made for it brings torch to raise
         raise InputError(f"{path}: holds more than tensors and numbers (a pickle), which is never loaded") from problem
     if not isinstance(state, dict) or state.get("config_digest") != config_digest:
         raise InputError(f"{path}: saved under another configuration than the run's config.json; do not mix runs")
+    try:
+        check_tensors(state)
+    except ValueError as problem:
+        raise InputError(f"{path}: was not saved by a training ({problem}); do not use it") from problem
     return state
 
 

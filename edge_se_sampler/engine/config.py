@@ -11,9 +11,11 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import tyro
 
 from edge_se_sampler.data.config import DataFormat, Masks, VanillaDataManagerConfig
+from edge_se_sampler.data.scene_file import quote
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.config import (
     INFINITY,
+    MAX_RAYS,
     LeanModelConfig,
     ModelConfig,
     NeRFModelConfig,
@@ -127,7 +129,7 @@ class TrainerConfig(InstantiateConfig):
             return None
         match = re.fullmatch(r"(\d+(?:\.\d*)?) *([smh]?)", self.time_budget.strip())
         seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
-        check_value("time-budget", self.time_budget, seconds > 0, "seconds above 0, or 10m, or 1h")
+        check_value("time-budget", quote(self.time_budget), 0 < seconds < INFINITY, "seconds above 0, or 10m, or 1h")
         return seconds
 
     @property
@@ -149,6 +151,9 @@ class TrainerConfig(InstantiateConfig):
         }
         for flag, value in at_least_one.items():
             check_value(flag, value, value is None or value >= 1, "at least 1")
+        rays = self.preset.rays
+        flag = "pipeline.datamanager.train-num-rays-per-batch"
+        check_value(flag, rays, rays <= MAX_RAYS, f"at most {MAX_RAYS}")
         seconds = self.max_seconds
         check_value("max-seconds", seconds, seconds is None or 0 < seconds < INFINITY, "above 0, and finite")
         check_value("min-gain", self.min_gain, 0 <= self.min_gain < INFINITY, "at least 0, and finite")

@@ -21,7 +21,8 @@ def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) ->
     temporary = path.parent / f".{path.name}.tmp"
     with os_errors_as_input_errors(f"{path}: cannot be written, what was there before is untouched"):
         try:
-            with open(temporary, "wb") as file:
+            temporary.unlink(missing_ok=True)  # it may be a link that leads elsewhere
+            with open(temporary, "xb") as file:
                 file.write(content) if isinstance(content, bytes) else content(file)
                 file.flush()
                 os.fsync(file.fileno())

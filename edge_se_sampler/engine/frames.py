@@ -124,6 +124,6 @@ def _is_whole(path: Path) -> bool:
     try:
         with Image.open(path) as image:
             image.load()
-    except (OSError, SyntaxError):  # a bad checksum is the latter
+    except Exception:  # OSError, SyntaxError, DecompressionBombError, ...
         return False
     return True

@@ -17,6 +17,7 @@ from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.depths import find_depths
 from edge_se_sampler.occupancy.hull import Hull
+from edge_se_sampler.occupancy.saved_grid import check_grid
 from edge_se_sampler.occupancy.scene_analysis import SceneAnalysis, analyze_scene
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -89,10 +90,13 @@ def build_model(config: TrainerConfig, device: str, grid: BrickGrid | None = Non
 def saved_grid(weights: Mapping[str, Tensor]) -> BrickGrid | None:
     """The grid in a checkpoint's weights, None if it has none; InputError if another version wrote it."""
     state = {key.removeprefix("grid."): value for key, value in weights.items() if key.startswith("grid.")}
+    if not state:
+        return None
     try:
-        return BrickGrid.from_state(state) if state else None
-    except KeyError as problem:
-        raise InputError(OTHER_WEIGHTS) from problem
+        check_grid(state)
+        return BrickGrid.from_state(state)
+    except (KeyError, ValueError) as problem:
+        raise InputError(f"{OTHER_WEIGHTS} ({problem})") from problem
 
 
 def load_weights(model: RayModel, weights: Mapping[str, Tensor]) -> None:

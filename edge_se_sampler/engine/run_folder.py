@@ -16,8 +16,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from edge_se_sampler.data.scene_file import SourceLocation, locate_file, quote, read_json
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import checksum, write_atomically, write_json
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
@@ -62,26 +64,30 @@ class RunFolder:
         path = self.path / "config.json"
         if not self.path.is_dir():
             raise InputError(f"{self.path}: no such run folder; edge-se train prints where a run lands")
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{self.path}: not a run folder (no config.json); edge-se train prints it") from None
-        except (OSError, ValueError) as problem:
-            raise InputError(f"{path}: not readable as json ({problem})") from problem
-        if not isinstance(values, dict):
-            raise InputError(f"{path}: not an object")
-        claimed, digest = values.pop("checksum", None), checksum(values)
-        number = values.pop("format", OLDEST_FORMAT)
+        if not path.exists():
+            raise InputError(f"{self.path}: not a run folder (no config.json); edge-se train prints it")
+        for name in ("config.json", "metrics.jsonl", "checkpoints", "previews"):
+            locate_file(self.path, name, SourceLocation(self.path))
+        written = read_json(path).object()
+        claimed = written.pop("checksum", None)
+        number = written.get("format", OLDEST_FORMAT)
         if number not in range(OLDEST_FORMAT, FORMAT + 1):
-            raise InputError(f"{path}: its format is {number!r}, this version reads {OLDEST_FORMAT} to {FORMAT}")
+            problem = f"its format is {quote(number)}, this version reads {OLDEST_FORMAT} to {FORMAT}"
+            raise InputError(f"{path}: {problem}")
+        values = {key: value for key, value in written.items() if key != "format"}
         name = values.get("method_name")
         default = method_configs.get(str(name))
         if default is None:
-            raise InputError(f"{path}: method_name is {name!r}, which is not registered here; see edge-se methods")
+            problem = f"method_name is {quote(name)}, which is not registered here"
+            raise InputError(f"{path}: {problem}; see edge-se methods")
         config = config_from_json(default, values, f"{path}")
-        if claimed not in (None, digest):
+        if claimed not in (None, checksum(written)):
             remedy = 'restore it, or, if you did, remove its "checksum"'
             raise InputError(f"{path}: changed since it was written (checksum); {remedy}")
+        try:
+            config.check()
+        except InputError as problem:
+            raise InputError(f"{path}: {problem}") from problem
         return config
 
     def log(self, line: dict[str, Any]) -> None:
@@ -97,7 +103,7 @@ class RunFolder:
         if not path.exists():
             return []
         try:
-            has_checksums = json.loads((self.path / "config.json").read_bytes()).get("format", 2) > 2
+            has_checksums = read_json(self.path / "config.json").object().get("format", 2) > 2
             *complete, rest = path.read_text(encoding="utf-8").split("\n")
             lines = [json.loads(line) for line in complete]
             for line in lines:
@@ -105,8 +111,8 @@ class RunFolder:
                 is_checked = claimed == _crc32(line) or (claimed is None and not has_checksums)
                 if not isinstance(line["step"], int) or not is_checked:
                     raise ValueError(f"the line of step {line['step']} is not as it was written")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
-            raise InputError(f"{path}: damaged ({problem!r}); mend or remove it") from problem
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as problem:
+            raise InputError(f"{path}: damaged ({quote(problem)}); mend or remove it") from problem
         if rest:
             print(f"edge-se: {path}: its last line was cut short and is left out", file=sys.stderr)
         return lines
@@ -189,20 +195,44 @@ def _drop_added_defaults(config: Any, values: dict[str, Any]) -> None:
 def config_from_json(default: Any, values: Any, where: str) -> Any:
     """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped.
     Fields that were added later may be missing: they have their defaults."""
-    fields = {field.name: field for field in dataclasses.fields(default)}
+    types, fields = get_type_hints(type(default)), dataclasses.fields(default)
+    hints = {field.name: types[field.name] for field in fields}
     if isinstance(values, dict):
-        values = {name: f.default for name, f in fields.items() if f.metadata.get("added_later")} | values
-    if not isinstance(values, dict) or set(values) != set(fields):
-        differing = sorted(set(values) ^ set(fields)) if isinstance(values, dict) else "not an object"
+        values = {f.name: f.default for f in fields if f.metadata.get("added_later")} | values
+    if not isinstance(values, dict) or set(values) != set(hints):
+        differing = quote(sorted(set(values) ^ set(hints)) if isinstance(values, dict) else "not an object")
         raise InputError(f"{where}: written by another version of edge-se or edited by hand (fields: {differing})")
     chosen = {}
-    for name, field in fields.items():
+    for name, hint in hints.items():
         old, new = getattr(default, name), values[name]
         if dataclasses.is_dataclass(old):
-            new = config_from_json(old, new, f"{where}: {name}")
-        elif "Path" in str(field.type) and isinstance(new, str):
-            new = Path(new)
-        elif (type(old), type(new)) != (float, int) and None not in (old, new) and type(old) is not type(new):
-            raise InputError(f"{where}: {name} is {new!r}, where {old!r} would be of its type; was it edited by hand?")
-        chosen[name] = new
+            chosen[name] = config_from_json(old, new, f"{where}: {name}")
+            continue
+        try:
+            chosen[name] = _typed(new, hint)
+        except ValueError:
+            problem = f"{name} is {quote(new)}, where {quote(old)} would be of its type"
+            raise InputError(f"{where}: {problem}; was it edited by hand?") from None
     return dataclasses.replace(default, **chosen)
+
+
+def _typed(value: Any, hint: Any) -> Any:
+    """A json value as the type that a field is annotated with; ValueError if it cannot be one."""
+    options = get_args(hint)
+    if get_origin(hint) is Literal:
+        if isinstance(value, str) and value in options:
+            return value
+    elif get_origin(hint) is tuple and isinstance(value, list):
+        kinds = options[:1] * len(value) if options[-1] is Ellipsis else options
+        return tuple(_typed(item, kind) for item, kind in zip(value, kinds, strict=True))
+    elif get_origin(hint) in (Union, UnionType):
+        for option in options:
+            with contextlib.suppress(ValueError):
+                return _typed(value, option)
+    elif hint is Path and isinstance(value, str) and "\0" not in value:
+        return Path(value)
+    elif (type(value) is hint or (type(value), hint) == (int, float)) and not (
+        isinstance(value, int) and abs(value) >= 2**63
+    ):
+        return value
+    raise ValueError

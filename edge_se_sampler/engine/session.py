@@ -26,6 +26,7 @@ from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights,
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import Picture, to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
+from edge_se_sampler.engine.saved_state import check_parts
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig, apply_preset, decide_size
@@ -87,6 +88,13 @@ def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
     return resolved
 
 
+def load_state(run: RunFolder, config: TrainerConfig) -> tuple[Path, dict[str, Any]]:
+    """A run's last checkpoint, and what it holds; InputError if it is bad."""
+    checkpoint, state = load_latest(run.checkpoints, config_digest(config))
+    check_parts(state, config.pipeline.model)
+    return checkpoint, state
+
+
 def prepare_resume(
     run: RunFolder,
     config: TrainerConfig,
@@ -97,7 +105,7 @@ def prepare_resume(
     """Continue a run under its own settings, but for max_seconds, and max_num_iterations if that is given: what a
     finished one then goes on with is its optimizer's state. InputError for a bad run or data, and for training images
     that have changed, unless that is accepted; what the sampler remembers of them is then forgotten."""
-    _, state = load_latest(run.checkpoints, config_digest(config))
+    _, state = load_state(run, config)
     if max_num_iterations is not None:
         config = _extend(config, state, max_num_iterations)
     session_config = replace(config, max_seconds=max_seconds)
@@ -120,7 +128,7 @@ def _extend(config: TrainerConfig, state: dict[str, Any], num_iterations: int) -
 
 def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     """A run's model with the weights of its last checkpoint, and that checkpoint; InputError if it is bad."""
-    checkpoint, state = load_latest(run.checkpoints, config_digest(config))
+    checkpoint, state = load_state(run, config)
     model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
     load_weights(model, state["model"])
     return model, checkpoint

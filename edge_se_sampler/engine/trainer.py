@@ -27,6 +27,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, render_view
 from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
+from edge_se_sampler.engine.saved_state import check_training, load_sampler
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import TrainingCallbackAttributes, TrainingCallbackLocation
 from edge_se_sampler.sampling.random_streams import Stream, stream
@@ -83,6 +84,7 @@ class Trainer:
             remedy = "restore them, or add --changed-data True"
             raise InputError(f"{self.config.data}: not the training images that the run began with; {remedy}")
         load_weights(self.pipeline.model, state["model"])
+        check_training(state, self)
         if state["optimizer"] is not None:  # of a run that has ended
             self.optimizer.load_state_dict(state["optimizer"])
         self.plan.load_state_dict(state["plan"])
@@ -91,7 +93,7 @@ class Trainer:
             self.dead_network_reset.load_state_dict(state["dead_network_reset"])
         self.early_stopping.load_state_dict(state.get("early_stopping", {}))
         if is_same_data:
-            self.pipeline.datamanager.load_state_dict(state["sampler"])
+            load_sampler(self.pipeline.datamanager, state["sampler"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
         for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
             group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another

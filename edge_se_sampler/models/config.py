@@ -10,6 +10,8 @@ from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 
 INFINITY = float("inf")
+MAX_SAMPLES, MAX_RAYS = 2**14, 2**24
+"""Of a ray along it, and rays of a step: more would be a mistake, or a stranger's."""
 BYTES_PER_RAY = 2**15
 """Of the lean model's samples on a ray of a training step."""
 GIB_PER_PIXEL = 1 / 400
@@ -167,8 +169,8 @@ class NeRFModelConfig(ModelConfig):
             frequencies = getattr(preset, f"{name}_frequencies")
             check_value(f"{prefix}{name}-frequencies", frequencies, 0 <= frequencies <= 24, "between 0 and 24")
         coarse, fine = preset.num_coarse_samples, preset.num_importance_samples
-        check_value(f"{prefix}num-coarse-samples", coarse, coarse >= 3, "at least 3")
-        check_value(f"{prefix}num-importance-samples", fine, fine >= 1, "at least 1")
+        check_value(f"{prefix}num-coarse-samples", coarse, 3 <= coarse <= MAX_SAMPLES, f"3 to {MAX_SAMPLES}")
+        check_value(f"{prefix}num-importance-samples", fine, 1 <= fine <= MAX_SAMPLES, f"1 to {MAX_SAMPLES}")
         check_value(f"{prefix}density-noise", self.density_noise, 0 <= self.density_noise < INFINITY, "at least 0")
 
 

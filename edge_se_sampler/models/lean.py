@@ -25,6 +25,7 @@ from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
 from edge_se_sampler.models.voxel_backend import choose_ops, compiled_ops
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.saved_grid import MAX_SIZE
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
 FEATURE_DIM, WIDTH = 16, 64
@@ -185,6 +186,8 @@ class LeanModel(RayModel):
             near, far = (rays.metadata[name][:, 0] / float(cell_size) for name in ("nears", "fars"))
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
+        # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid
+        end = torch.where((origins.abs() < MAX_SIZE).all(dim=1), end, 0)
         return RaySpans(
             origins,
             rays.directions,

@@ -55,7 +55,7 @@ class CellTable:
         numbers = batch.numbers.tolist()
         new = [k for k, number in enumerate(numbers) if number not in self._index]
         if new:
-            self._grow({numbers[k]: batch.sizes[k] for k in new})
+            self.grow({numbers[k]: batch.sizes[k] for k in new})
             order = {number: i for i, number in enumerate(self.sizes)}
             for k in new:
                 self._index[numbers[k]] = order[numbers[k]]
@@ -64,7 +64,7 @@ class CellTable:
             self.refresh()
         return torch.tensor([self._index[number] for number in numbers])
 
-    def _grow(self, sizes: dict[int, tuple[int, int]]) -> None:
+    def grow(self, sizes: dict[int, tuple[int, int]]) -> None:
         """Make room for images; those of a loaded state are here already."""
         known, images = len(self.values), len(self.sizes)
         self.sizes |= {number: size for number, size in sizes.items() if number not in self.sizes}
@@ -161,6 +161,9 @@ class CellTable:
         else:
             which = (u[0] * len(indices)).astype(np.int64)
         block = np.searchsorted(self._cumulative[1:], low[which] + u[1] * mass[which], side="right")
+        first, end = self._first_block[indices[which]], self._first_block[indices[which] + 1]
+        for i in np.flatnonzero((block < first) | (block >= end)):  # rounding: other images have much larger values
+            block[i] = first[i] + self._mass[first[i] : end[i]].argmax()
         weights = self._weights(block).cumsum(axis=1)
         cell = BLOCK * block + (weights <= (u[2] * weights[:, -1])[:, None]).sum(axis=1)
         row, column = self._draw_in_cells(indices[which], cell, rng)
@@ -208,7 +211,7 @@ class CellTable:
     def from_state(cls, state: dict[str, Any]) -> CellTable:
         """What `state_dict` was taken of."""
         table = cls(state["side"], new_value=state["new_value"], across_images=state["across_images"])
-        table._grow({number: (height, width) for number, height, width in state["sizes"]})
+        table.grow({number: (height, width) for number, height, width in state["sizes"]})
         table.values = state["values"].numpy().copy()
         table.refresh()
         return table

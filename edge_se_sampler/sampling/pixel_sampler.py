@@ -130,20 +130,20 @@ class ImportantPixels:
     @property
     def needs_errors(self) -> bool:
         """Whether training has to tell it the squared errors that it finds, by `observe`."""
-        return self.is_bound and any(part.needs_errors for part in self._parts().values())
+        return self.is_bound and any(part.needs_errors for part in self.parts().values())
 
     def state_dict(self) -> dict[str, Any]:
         """What later draws depend on besides the step, for a checkpoint."""
-        states = {name: part.state_dict() for name, part in self._parts().items()}
+        states = {name: part.state_dict() for name, part in self.parts().items()}
         return {name: state for name, state in states.items() if state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned, once bound to a run with the same settings."""
-        parts = self._parts()
+        parts = self.parts()
         for name, part_state in state.items():
             parts[name].load_state_dict(part_state)
 
-    def _parts(self) -> dict[str, SamplerPart]:
+    def parts(self) -> dict[str, SamplerPart]:
         """Everything that may learn from errors, by its name in a checkpoint."""
         parts: dict[str, SamplerPart] = {"schedule": self.schedule}
         for name, strategy in self.strategies.items():
@@ -173,7 +173,7 @@ class ImportantPixels:
         return errors
 
     def _update(self, drawn: PixelBatch, squared_error: Tensor) -> None:
-        for part in self._parts().values():
+        for part in self.parts().values():
             if part.needs_errors:
                 part.update(drawn, squared_error.detach(), self._step)
 

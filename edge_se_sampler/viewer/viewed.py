@@ -12,13 +12,14 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.engine.checkpoint import latest_checkpoint, load_latest
+from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
-from edge_se_sampler.engine.run_folder import RunFolder, config_digest
-from edge_se_sampler.engine.session import choose_device, read_train_views
+from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.saved_state import load_sampler
+from edge_se_sampler.engine.session import choose_device, load_state, read_train_views
 from edge_se_sampler.engine.show import probability_map
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.engine.trajectories import find_up
@@ -63,7 +64,7 @@ class Viewed:
     def load(cls, run: RunFolder, config: TrainerConfig) -> Viewed:
         """A run at its last checkpoint; nothing is written. InputError for a bad run or data."""
         newest = latest_checkpoint(run.checkpoints)
-        _, state = load_latest(run.checkpoints, config_digest(config))
+        _, state = load_state(run, config)
         device, views = choose_device(config.machine.device_type), read_train_views(config)
         pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
         load_weights(pipeline.model, state["model"])
@@ -78,7 +79,7 @@ class Viewed:
         newest = latest_checkpoint(trainer.run.checkpoints)
         if newest != self._newest:
             self._newest = newest
-            _, state = load_latest(trainer.run.checkpoints, config_digest(trainer.config))
+            _, state = load_state(trainer.run, trainer.config)
             model = build_model(trainer.config, str(trainer.pipeline.model.device), saved_grid(state["model"]))
             load_weights(model, state["model"])
             self._take(state, model)
@@ -87,8 +88,8 @@ class Viewed:
         """Show a checkpoint's model, and its sampler."""
         trainer, manager = self.trainer, self.trainer.pipeline.datamanager
         with self.turns:
+            load_sampler(manager, state["sampler"])
             trainer.pipeline, trainer.next_step = replace(trainer.pipeline, model=model), state["step"] + 1
-            manager.load_state_dict(state["sampler"])
             if isinstance(manager.train_pixel_sampler, ImportantPixels):
                 manager.train_pixel_sampler.set_step(state["step"])
 
