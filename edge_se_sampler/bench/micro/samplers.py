@@ -38,8 +38,8 @@ def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
         # what nerfstudio's PixelSampler.sample_method computes without a mask
         "for comparison: nerfstudio 1.1.5's uniform pixels": lambda _: (torch.rand((draws, 3)) * extent).long(),
     }
-    for name in ("uniform", "error-map", "error-cdf", "soft-mining", "actray"):
-        cases[f"ten steps of `{name}`, of all images: pixels drawn, errors learnt from"] = ten_steps(
+    for name in ("uniform", "error-map", "error-cdf", "soft-mining", "actray", "regions", "quadtree", "expansive"):
+        cases[f"ten steps of {name}, of all images: pixels drawn, errors learnt from"] = ten_steps(
             name, images, size, draws
         )
     return {"tables": tables, "milliseconds": median_milliseconds(cases, rounds)}
