@@ -49,7 +49,7 @@ def change_value(value: Any, rng: random.Random) -> None:
 
 def changed_tensor(tensor: Tensor, rng: random.Random) -> Any:
     """Another shape, type or number."""
-    if tensor.numel() > 2**24:  # it repeats its numbers already
+    if tensor.is_sparse or tensor.numel() > 2**24:  # it was changed before, or repeats its numbers
         return tensor
     ways: list[Callable[[], Any]] = [
         lambda: tensor.double(),

@@ -75,7 +75,7 @@ def torch_groups(groups: Sequence[ParameterGroup], learning_rate: float, rays: i
 
 def build_adam(groups: list[dict[str, Any]], config: OptimizerConfig) -> RowAdam:
     """Adam over `torch_groups`."""
-    betas = (0.9, config.beta2)
+    betas = (0.9, float(config.beta2))  # torch refuses an int, which json may have
     if config.fused:
         with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
             return RowAdam(groups, betas=betas, eps=config.eps, fused=True)
