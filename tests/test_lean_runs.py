@@ -64,8 +64,8 @@ def test_a_time_budget_is_kept_and_its_plan_repeats_it_bit_for_bit(scene: Path, 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"time_budget": "10 parsecs"}, "--time-budget is 10 parsecs"),
-        ({"time_budget": "0"}, "--time-budget is 0"),
+        ({"time_budget": "10 parsecs"}, "--time-budget is '10 parsecs'"),
+        ({"time_budget": "0"}, "--time-budget is '0'"),
         ({"time_budget": "60", "max_num_iterations": 7}, "--max-num-iterations and --time-budget"),
         ({"segments": (1, 2, 3)}, "--segments"),
         ({f"{MODEL}.prune_weight": 1.0}, "prune-weight"),
