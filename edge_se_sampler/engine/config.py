@@ -28,7 +28,7 @@ class MachineConfig:
 
     seed: int = 0
     """Seed of weights, pixels and jitter. The same seed gives every method the same initial weights."""
-    device_type: Literal["auto", "cpu", "cuda"] = "auto"
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on; auto is a GPU if there is one."""
 
 

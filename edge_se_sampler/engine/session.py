@@ -158,8 +158,8 @@ def read_train_views(config: TrainerConfig) -> Views:
 
 
 def _training_memory(config: TrainerConfig, longest: int) -> int:
-    """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's."""
-    if choose_device(config.machine.device_type) != "cpu":
+    """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's own."""
+    if choose_device(config.machine.device_type) == "cuda":
         return 0
     return decide_size(config.pipeline.model, longest).training_memory
 
@@ -220,11 +220,13 @@ def describe_run(trainer: Trainer) -> str:
 
 
 def choose_device(device_type: str) -> str:
-    """The torch device of --machine.device-type; InputError for cuda where torch finds no GPU."""
-    has_gpu = torch.cuda.is_available()
-    if device_type == "cuda" and not has_gpu:
-        raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
-    return "cuda" if device_type != "cpu" and has_gpu else "cpu"
+    """The torch device of --machine.device-type; InputError for a GPU that torch does not find."""
+    gpus = [name for name, backend in (("cuda", torch.cuda), ("mps", torch.backends.mps)) if backend.is_available()]
+    if device_type == "auto":
+        return [*gpus, "cpu"][0]
+    if device_type not in [*gpus, "cpu"]:
+        raise InputError(f"--machine.device-type is {device_type}, but torch finds no GPU for it; use auto or cpu")
+    return device_type
 
 
 def disable_malloc_trimming() -> None:
