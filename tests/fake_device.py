@@ -25,8 +25,9 @@ class FakeTensor(Tensor):
     def __new__(cls, inner: Tensor) -> FakeTensor:
         if inner.dtype == torch.float64:
             raise TypeError(f"{DEVICE} has no float64")
+        place = {} if inner.is_sparse else {"strides": inner.stride(), "storage_offset": inner.storage_offset()}
         fake = Tensor._make_wrapper_subclass(  # pyright: ignore[reportAttributeAccessIssue]
-            cls, inner.shape, dtype=inner.dtype, layout=inner.layout, device=DEVICE
+            cls, inner.shape, dtype=inner.dtype, layout=inner.layout, device=DEVICE, **place
         )
         fake.inner = inner
         return fake
@@ -64,6 +65,8 @@ class _Constants(TorchFunctionMode):
             func, args, kwargs = torch.tensor, args[1:], {"dtype": args[0].dtype, "device": DEVICE} | kwargs
         if func is torch.tensor and torch.device(kwargs.get("device") or "cpu") == DEVICE:
             return torch.tensor(*args, **kwargs | {"device": "cpu"}).to(DEVICE)
+        if func is Tensor.__getitem__ and isinstance(args[0], FakeTensor) and isinstance(args[1], list):
+            args = args[0], torch.tensor(args[1]).to(DEVICE)
         if func is Tensor.tolist and isinstance(args[0], FakeTensor):
             return args[0].inner.tolist()
         return func(*args, **kwargs)

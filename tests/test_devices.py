@@ -12,7 +12,7 @@ from fake_device import DEVICE, FakeTensor, fake_device
 from tiny import tiny_config, tiny_trainer, tiny_views
 
 from edge_se_sampler import devices
-from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.config import TrainerConfig, override
 from edge_se_sampler.engine.session import choose_device
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
@@ -85,7 +85,7 @@ def test_nerfs_train_on_a_device_of_their_own(method: str, model: dict[str, Any]
 
 def test_lean_nerf_trains_on_a_device_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voxel_backend, "compiled_ops", lambda: None)
-    config = lean_models.config_of(40)
+    config = override(lean_models.config_of(40), {"optimizer.fused": False})  # which torch has for real devices alone
     with fake_device():
         trainer = tiny_trainer(config, lean_models.VIEWS, device=str(DEVICE))
         found = losses(trainer, 40)
