@@ -58,9 +58,7 @@ def nerf_trainer(method: str, device: str, **model: Any) -> Trainer:
     pipeline = replace(
         config.pipeline, datamanager=manager, model=replace(config.pipeline.model, num_importance_samples=5, **changed)
     )
-    return tiny_trainer(
-        replace(config, pipeline=pipeline, max_num_iterations=8), tiny_views(3, 12, 12), device=device
-    )
+    return tiny_trainer(replace(config, pipeline=pipeline, max_num_iterations=8), tiny_views(3, 12, 12), device=device)
 
 
 def losses(trainer: Trainer, steps: int) -> list[float]:
