@@ -11,6 +11,7 @@ import hashlib
 import io
 import pickle
 import sys
+import warnings
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -116,7 +117,9 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     if header[len(MAGIC) :] != digest.hexdigest().encode():
         raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
     try:
-        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "TypedStorage")  # torch 2.1's own use of it
+            state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as problem:
         raise InputError(f"{path}: holds more than tensors and numbers (a pickle), which is never loaded") from problem
     if not isinstance(state, dict) or state.get("config_digest") != config_digest:
