@@ -17,9 +17,9 @@ DEVICE = torch.device("meta")
 
 
 class FakeTensor(Tensor):
-    """On `DEVICE`, as it says; `inner` holds its values, on the CPU."""
+    """On `DEVICE`, as it says; `on_cpu` holds its values."""
 
-    inner: Tensor
+    on_cpu: Tensor
 
     @staticmethod
     def __new__(cls, inner: Tensor) -> FakeTensor:
@@ -29,11 +29,11 @@ class FakeTensor(Tensor):
         fake = Tensor._make_wrapper_subclass(  # pyright: ignore[reportAttributeAccessIssue]
             cls, inner.shape, dtype=inner.dtype, layout=inner.layout, device=DEVICE, **place
         )
-        fake.inner = inner
+        fake.on_cpu = inner
         return fake
 
     def __repr__(self, **_: Any) -> str:
-        return f"FakeTensor({self.inner!r})"
+        return f"FakeTensor({self.on_cpu!r})"
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore[reportAssignmentType]
 
@@ -48,7 +48,7 @@ class FakeTensor(Tensor):
     @data.setter
     def data(self, value: FakeTensor) -> None:
         Tensor.data.__set__(self, value)  # pyright: ignore[reportAttributeAccessIssue]
-        self.inner = value.inner
+        self.on_cpu = value.on_cpu
 
 
 class _Operations(TorchDispatchMode):
@@ -68,7 +68,7 @@ class _Constants(TorchFunctionMode):
         if func is Tensor.__getitem__ and isinstance(args[0], FakeTensor) and isinstance(args[1], list):
             args = args[0], torch.tensor(args[1]).to(DEVICE)
         if func is Tensor.tolist and isinstance(args[0], FakeTensor):
-            return args[0].inner.tolist()
+            return args[0].on_cpu.tolist()
         return func(*args, **kwargs)
 
 
@@ -103,11 +103,11 @@ def _compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         kwargs = kwargs | {"device": torch.device("cpu")}
     elif func == torch.ops.aten.copy_.default:
         on_device = isinstance(args[0], FakeTensor)
-    inner_args, inner_kwargs = tree_map(lambda x: x.inner if isinstance(x, FakeTensor) else x, (args, kwargs))
+    inner_args, inner_kwargs = tree_map(lambda x: x.on_cpu if isinstance(x, FakeTensor) else x, (args, kwargs))
     result = func(*inner_args, **inner_kwargs)
     if func == torch.ops.aten._to_copy.default and fakes and result.dtype == torch.float64:
         raise TypeError(f"{DEVICE} has no float64")
-    known = {id(value.inner): value for value in fakes}
+    known = {id(value.on_cpu): value for value in fakes}
 
     def outer(value: Any) -> Any:
         if not isinstance(value, Tensor) or not on_device:

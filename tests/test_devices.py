@@ -115,7 +115,7 @@ def test_the_fake_device_refuses_what_a_real_one_does() -> None:
     with fake_device():
         there, here = torch.ones(3, device=DEVICE), torch.ones(3)
         with pytest.raises(RuntimeError, match="same device"):
-            there + here
+            _ = there + here
         with pytest.raises(TypeError, match="float64"):
             there.double()
         with pytest.raises(TypeError, match="float64"):
