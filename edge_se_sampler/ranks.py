@@ -35,8 +35,8 @@ def is_main() -> bool:
 
 
 def join(device: str) -> None:
-    """Meet the other processes that torchrun has started, if it has; `device` is "cuda" or "cpu". InputError: there is
-    no GPU for this one."""
+    """Meet the other processes that torchrun has started, if it has; `device` is "cuda", "mps" or "cpu". InputError:
+    there is no GPU for this one."""
     global _rank, _world_size
     world = int(os.environ.get("WORLD_SIZE", 1))
     if world == _world_size or not {"RANK", "MASTER_ADDR"} <= os.environ.keys():
@@ -44,6 +44,8 @@ def join(device: str) -> None:
     import torch
     from torch import distributed
 
+    if device == "mps":
+        raise InputError("several processes cannot share an Apple GPU; use --machine.device-type cpu")
     if device == "cuda":
         local, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
         if local >= count:

@@ -272,7 +272,7 @@ def test_too_little_memory_is_one_line(scene: Path, tmp_path: Path, edge_se):
     assert "transforms_train.json: training on its 3 images takes 11,925,811.8 GiB of memory" in line
 
 
-@pytest.mark.parametrize("problem", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory")])
+@pytest.mark.parametrize("problem", [MemoryError(), torch.cuda.OutOfMemoryError("CUDA out of memory")])
 def test_allocations_that_fail_elsewhere_are_one_line_too(problem: Exception, tmp_path: Path, edge_se, monkeypatch):
     monkeypatch.setattr("edge_se_sampler.commands.registered_methods", raising(problem))
     assert "not enough memory" in refused(edge_se, tmp_path, "methods")

@@ -38,7 +38,9 @@ def test_sums_to_one_over_the_pixels_that_have_strength(strength: np.ndarray) ->
     assert not p[strength == 0].any()
     assert abs(p.sum() - strength.any()) < 1e-12
     if strength.any():
-        np.testing.assert_allclose(p, strength / strength.sum(dtype=np.float64), rtol=0, atol=QUANTUM)
+        np.testing.assert_allclose(
+            p, strength.astype(np.float64) / strength.sum(dtype=np.float64), rtol=0, atol=QUANTUM
+        )
     np.testing.assert_array_equal(strength, before)
 
 

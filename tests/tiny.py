@@ -111,11 +111,11 @@ def check_gradients(model: nn.Module, loss: Callable[[], torch.Tensor]) -> None:
         assert numeric == pytest.approx(analytic, rel=1e-4, abs=1e-7), name
 
 
-def tiny_trainer(config: TrainerConfig, views: Views, output_dir: Path | None = None) -> Trainer:
+def tiny_trainer(config: TrainerConfig, views: Views, output_dir: Path | None = None, device: str = "cpu") -> Trainer:
     """A trainer on views; without a folder for its run it can take steps, which write nothing, but not save."""
     config = resolve_config(replace(config, output_dir=output_dir or config.output_dir), views)
     run = RunFolder.create(config) if output_dir else RunFolder(Path("never written"))
-    return config.setup(run=run, pipeline=Pipeline.build(config, views, "cpu"), preview=None)
+    return config.setup(run=run, pipeline=Pipeline.build(config, views, device), preview=None)
 
 
 def resume_trainer(trainer: Trainer, views: Views) -> Trainer:

@@ -131,7 +131,7 @@ class Cameras:
     def interpolate(self, first: int, second: int, fraction: float) -> Cameras:
         """One camera at a fraction, in [0, 1], of the way between two, with the first one's intrinsics and size. It
         rotates at an even rate, and the world's origin moves evenly in its view."""
-        a, b = self.camera_to_worlds[first].double(), self.camera_to_worlds[second].double()
+        a, b = (self.camera_to_worlds[i].cpu().double() for i in (first, second))
         rotation = a[:, :3] @ rotation_power(a[:, :3].T @ b[:, :3], fraction)
         origin_in_camera = torch.lerp(a[:, :3].T @ a[:, 3], b[:, :3].T @ b[:, 3], fraction)
         pose = torch.cat((rotation, (rotation @ origin_in_camera)[:, None]), dim=1).to(self.camera_to_worlds)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import sys
+import warnings
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -118,7 +119,9 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
         raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
     try:
         check_archive(payload)
-        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "TypedStorage")  # torch 2.1's own use of it
+            state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
     except MemoryError:
         raise
     except Exception as problem:  # whatever a pickle that was made for it brings torch to raise

@@ -30,8 +30,8 @@ class MachineConfig:
 
     seed: int = 0
     """Seed of weights, pixels and jitter. The same seed gives every method the same initial weights."""
-    device_type: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to train on; auto is a GPU if there is one."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to train on; auto is cuda if torch finds such a GPU, else the CPU; mps is an Apple GPU."""
 
 
 @dataclass(frozen=True)

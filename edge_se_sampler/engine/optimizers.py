@@ -78,7 +78,7 @@ def build_adam(groups: list[dict[str, Any]], config: OptimizerConfig) -> RowAdam
     betas = (0.9, float(config.beta2))  # torch refuses an int, which json may have
     if config.fused:
         with suppress(RuntimeError):  # before torch 2.4, for weights on a GPU only
-            return RowAdam(groups, betas=betas, eps=config.eps, fused=True)
+            return RowAdam([dict(group) for group in groups], betas=betas, eps=config.eps, fused=True)
     return RowAdam(groups, betas=betas, eps=config.eps)
 
 

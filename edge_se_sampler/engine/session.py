@@ -166,8 +166,8 @@ def read_train_views(config: TrainerConfig) -> Views:
 
 
 def _training_memory(config: TrainerConfig, longest: int) -> int:
-    """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's."""
-    if choose_device(config.machine.device_type) != "cpu":
+    """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's own."""
+    if choose_device(config.machine.device_type) == "cuda":
         return 0
     return decide_size(config.pipeline.model, longest).training_memory
 
@@ -228,11 +228,13 @@ def describe_run(trainer: Trainer) -> str:
 
 
 def choose_device(device_type: str) -> str:
-    """The torch device of --machine.device-type; InputError for cuda where torch finds no GPU."""
-    has_gpu = torch.cuda.is_available()
-    if device_type == "cuda" and not has_gpu:
-        raise InputError("--machine.device-type is cuda, but torch finds no GPU; use auto or cpu")
-    return "cuda" if device_type != "cpu" and has_gpu else "cpu"
+    """The torch device of --machine.device-type; InputError for a GPU that torch does not find."""
+    if device_type == "auto":  # mps only for who asks for it: nothing has been seen to train there
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    backends = {"cuda": torch.cuda, "mps": torch.backends.mps}
+    if device_type in backends and not backends[device_type].is_available():
+        raise InputError(f"--machine.device-type is {device_type}, but torch finds no GPU for it; use auto or cpu")
+    return device_type
 
 
 def disable_malloc_trimming() -> None:

@@ -97,6 +97,7 @@ class Trainer:
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
         for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
             group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another
+            group["fused"] = self.optimizer.defaults["fused"]  # the torch or the device may be another
         if ranks.is_main():
             self.run.drop_metrics_after(state["step"])
 

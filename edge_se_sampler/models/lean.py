@@ -176,14 +176,14 @@ class LeanModel(RayModel):
 
     def _spans(self, rays: RayBundle) -> RaySpans:
         """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it."""
-        cell_size = self.grid.cell_size
-        origins = ((rays.origins - self.grid.aabb_min) / cell_size).to(self.dtype)
+        cell_size = float(self.grid.cell_size)
+        origins = self.grid.to_cell_units(rays.origins).to(self.dtype)
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
-        norm = rays.metadata["directions_norm"][:, 0] / float(cell_size)
+        norm = rays.metadata["directions_norm"][:, 0] / cell_size
         near, far = (depth * norm for depth in self.config.depths)
         if "nears" in rays.metadata:
-            near, far = (rays.metadata[name][:, 0] / float(cell_size) for name in ("nears", "fars"))
+            near, far = (rays.metadata[name][:, 0] / cell_size for name in ("nears", "fars"))
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
         # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid

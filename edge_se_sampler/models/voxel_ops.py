@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from edge_se_sampler.devices import has_float64
 from edge_se_sampler.occupancy.bricks import BRICK, OFFSETS, BrickGrid, pack_bits, unpack_bits
 
 NUM_HARMONICS = 16
@@ -206,12 +207,25 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 def composite(tau: Tensor, color: Tensor, samples: Samples, num_rays: int) -> tuple[Tensor, Tensor, Tensor]:
     """Colors (n, 3), accumulated opacity (n, 1) and weights (c,) of colored samples, by tau (m,) and color (c, 3)
     (NeRF, equation 3)."""
-    total = torch.zeros(num_rays, dtype=torch.float64, device=tau.device)
-    total = total.index_add(0, samples.ray_indices, tau.double())
-    before = tau.double().cumsum(0) - tau - (total.cumsum(0) - total)[samples.ray_indices]
-    weight = (torch.exp(-before) * -torch.expm1(-tau.double())).to(tau.dtype)[samples.colored]
+    before, total = sum_along_rays(tau, samples.ray_indices, num_rays)
+    weight = (torch.exp(-before) * -torch.expm1(-tau.to(before.dtype))).to(tau.dtype)[samples.colored]
     rgb = tau.new_zeros((num_rays, 3)).index_add(0, samples.ray_indices[samples.colored], weight[:, None] * color)
     return rgb, -torch.expm1(-total)[:, None].to(tau.dtype), weight.detach()
+
+
+def sum_along_rays(tau: Tensor, ray_indices: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
+    """Sums of tau (m,) over the samples before each on its ray, (m,), and over rays, (n,); by ray_indices (m,),
+    ascending. In float64, where the device has it."""
+    if has_float64(tau.device):
+        total = torch.zeros(num_rays, dtype=torch.float64, device=tau.device)
+        total = total.index_add(0, ray_indices, tau.double())
+        return tau.double().cumsum(0) - tau - (total.cumsum(0) - total)[ray_indices], total
+    # float32 cannot hold a ray's part of the sum over all: a row for each ray
+    count = torch.bincount(ray_indices, minlength=num_rays)
+    column = torch.arange(len(tau), device=tau.device) - (count.cumsum(0) - count)[ray_indices]
+    sums = tau.new_zeros((num_rays, 1 + (int(count.max()) if num_rays else 0)))
+    sums = sums.index_put((ray_indices, column + 1), tau).cumsum(dim=1)
+    return sums[ray_indices, column], sums[:, -1]
 
 
 def resample(bricks: Tensor, ratio: float, parents: Tensor, values: Tensor) -> Tensor:

@@ -10,18 +10,21 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from edge_se_sampler import ranks
+from edge_se_sampler.devices import exact_type
 
 BRICK = 4
 """Cells along a brick."""
 MAX_DISTANCE = 8
 """Distances between bricks are counted up to here."""
+EXACT = ("aabb_min", "cell_size", "finest_size")
+"""What a grid has in float64: it stays on the CPU, and keeps its type."""
 OFFSETS = torch.cartesian_prod(*[torch.arange(2)] * 3)
 """(8, 3) int64: the corners of a cell, or a brick and its upper neighbors; the last axis is the fastest."""
 
@@ -85,7 +88,7 @@ class BrickGrid(nn.Module):
         num_pixels: int,
     ) -> None:
         super().__init__()
-        content = [values.cpu().numpy().tobytes() for values in (aabb_min.double(), bricks, occupied)]
+        content = [values.cpu().numpy().tobytes() for values in (aabb_min.cpu().double(), bricks, occupied)]
         digest = hashlib.sha256(b"".join(content) + str((cell_size, *size, max_level, num_pixels)).encode()).digest()
         self.register_buffer("scene", torch.tensor(list(digest), dtype=torch.uint8))
         self.register_buffer("level", torch.tensor(0))
@@ -93,7 +96,7 @@ class BrickGrid(nn.Module):
         self.register_buffer("num_pixels", torch.tensor(num_pixels))
         self.register_buffer("finest_size", torch.tensor(cell_size / 2**max_level, dtype=torch.float64))
         self.register_buffer("num_seen", torch.tensor(0))
-        self.register_buffer("aabb_min", aabb_min.double())
+        self.register_buffer("aabb_min", aabb_min.cpu().double())
         self.register_buffer("cell_size", torch.tensor(cell_size, dtype=torch.float64))
         self.register_buffer("size", torch.tensor(size))
         self.register_buffer("bricks", self._bricks_of_corners(bricks, occupied))
@@ -124,6 +127,14 @@ class BrickGrid(nn.Module):
         grid._index_bricks()
         grid.set_sampled(grid.sampled)
         return grid
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> BrickGrid:
+        """Move to another device, but for `EXACT`, which some do not have."""
+        kept: dict[str, Tensor | None] = {name: self._buffers[name] for name in EXACT}
+        self._buffers.update(dict.fromkeys(EXACT))
+        super()._apply(fn, recurse)
+        self._buffers.update(kept)
+        return self
 
     def is_of_the_same_scene(self, other: BrickGrid) -> bool:
         """Whether both began with the same cells."""
@@ -195,9 +206,16 @@ class BrickGrid(nn.Module):
         brick = torch.gather(self.neighbors[bricks].long(), 1, neighbor)
         return torch.where(brick < 0, -1, 64 * brick + corner)
 
+    def to_cell_units(self, positions: Tensor) -> Tensor:
+        """Positions (m, 3), world units, in sides of a cell from the box's least coordinates; float64, where their
+        device has it."""
+        device = positions.device
+        corner, cell_size = (x.to(device, exact_type(device)) for x in (self.aabb_min, self.cell_size))
+        return (positions - corner) / cell_size
+
     def contains(self, positions: Tensor) -> Tensor:
         """(m,) bool: whether positions (m, 3), world units, are in occupied cells."""
-        cell = ((positions - self.aabb_min) / self.cell_size).floor().long()
+        cell = self.to_cell_units(positions).floor().long()
         inside = ((cell >= 0) & (cell < self.size)).all(dim=1)
         brick = self.numbers[tuple(torch.where(inside[:, None], cell // BRICK, -1).T)].long()  # -1: none of the bricks
         inside = brick >= 0

@@ -76,7 +76,7 @@ class ActRay(LearnedDistribution):
     def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:
         """Enter errors, pass them on, and compute the probabilities anew if it is time."""
         _, index = self.tables(drawn.batch)
-        error = squared_error.double().cpu().numpy() / 3
+        error = squared_error.cpu().double().numpy() / 3
         cell = self.cells.cells_at(index, drawn.pixels)
         self.clock += 1
         cells, found = cell_means(cell, error)

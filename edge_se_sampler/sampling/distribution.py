@@ -189,6 +189,8 @@ def _flat(strength: Tensor) -> Tensor:
     if strength.ndim != 2 or strength.numel() == 0:
         raise ValueError(f"strengths must be (H, W) with at least one pixel, not {tuple(strength.shape)}")
     flat = strength.detach().cpu().reshape(-1)
+    if flat.dtype == torch.float16:
+        flat = flat.float()  # old torch finds no extremes of float16 on a CPU
     low, high = (float(extreme) for extreme in torch.aminmax(flat))
     if not (low >= 0 and high < float("inf")):
         raise ValueError("strengths must be finite and >= 0")

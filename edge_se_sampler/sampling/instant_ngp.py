@@ -47,7 +47,7 @@ class ErrorCdf(LearnedDistribution):
             per_image = self.interval * len(squared_error) / max(len(self.cells), len(drawn.batch.sizes))
             self.map = CellTable(max(1, int(SIDE_FACTOR * per_image**0.25)), new_value=0.0)
         images = self.map.add(drawn.batch)
-        error = squared_error.double().cpu().numpy() / drawn.density_ratio().numpy()
+        error = squared_error.cpu().double().numpy() / drawn.density_ratio().numpy()
         _deposit(self.map, images[drawn.pixels[:, 0]].numpy(), drawn.pixels[:, 1:].numpy(), error)
         self.steps += 1
         if self.steps == self.interval:

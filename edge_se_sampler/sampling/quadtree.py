@@ -130,7 +130,7 @@ class Quadtree(Distribution):
         tree = np.array([self.forest.row[number] for number in drawn.batch.numbers.tolist()])
         height, width = np.array(drawn.batch.sizes)[position].T
         cells = (tree[position], cell_of(row, height), cell_of(column, width))
-        self.forest.observe(cells, squared_error.double().cpu().numpy())
+        self.forest.observe(cells, squared_error.cpu().double().numpy())
         if self.forest.subdivide(self.settings.quadtree_threshold):
             self.clear()
 

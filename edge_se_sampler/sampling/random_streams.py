@@ -31,6 +31,8 @@ def stream(seed: int, step: int, purpose: Stream, rank: int = 0) -> np.random.Ge
         step: >= 0.
         rank: of the process in a distributed run, where each needs numbers of its own.
     """
+    if step < 0:
+        raise OverflowError(f"step is {step}, and must be >= 0")  # which numpy 2 says
     key = np.array([seed % 2**64, int(purpose)], dtype=np.uint64)
     counter = np.array([0, step, rank, 0], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=counter))

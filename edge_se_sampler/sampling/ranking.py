@@ -52,7 +52,7 @@ def sample_by_rank(squared_error: Tensor, keep: int, rng: np.random.Generator) -
         ValueError: N is out of range.
         FloatingPointError: an error that is not finite; it must never win a top rank.
     """
-    errors = squared_error.detach().double().cpu().numpy()
+    errors = squared_error.detach().cpu().double().numpy()
     if not 1 <= keep <= len(errors):
         raise ValueError(f"cannot keep {keep} of {len(errors)} candidates")
     if bad := np.count_nonzero(~np.isfinite(errors)):

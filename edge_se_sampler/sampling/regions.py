@@ -71,7 +71,7 @@ class Regions(Distribution):
         table, table_index = self.tables(drawn.batch)
         region = table.region(table_index, drawn.pixels)
         count = np.bincount(region, minlength=REGIONS)
-        total = np.bincount(region, squared_error.double().cpu().numpy(), minlength=REGIONS)
+        total = np.bincount(region, squared_error.cpu().double().numpy(), minlength=REGIONS)
         self.seen = np.minimum(self.seen + count, np.maximum(WINDOW_PIXELS, count))
         self.errors += (total - count * self.errors) / np.maximum(self.seen, 1)
 

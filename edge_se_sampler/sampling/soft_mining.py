@@ -131,7 +131,7 @@ class SoftMining(LearnedDistribution):
     def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:
         """Enter errors into the map, and tell the walkers theirs."""
         _, index = self.tables(drawn.batch)
-        q = np.sqrt(squared_error.double().cpu().numpy() / 3)
+        q = np.sqrt(squared_error.cpu().double().numpy() / 3)
         cells, found = cell_means(self.cells.cells_at(index, drawn.pixels), np.maximum(q, MIN_VALUE))
         self.map[cells] = np.where(self.map[cells] > 0, (self.map[cells] + found) / 2, found)
         if drawn.distribution is self:

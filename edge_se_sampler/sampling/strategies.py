@@ -90,7 +90,7 @@ class RankedError(Selector):
         """Enter the errors into the map."""
         assert self.error_map is not None
         self.error_map.add(drawn.batch.sizes_by_number)
-        pixels, errors = drawn.values["indices"].cpu().numpy(), squared_error.double().cpu().numpy()
+        pixels, errors = drawn.values["indices"].cpu().numpy(), squared_error.cpu().double().numpy()
         self.error_map.update(pixels, errors, step.number)
 
     def state_dict(self) -> dict[str, Any]:

@@ -31,5 +31,5 @@ class ErrorMapCells(LearnedDistribution):
     def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:
         """Enter errors into the map."""
         cells = self.cells.cells_at(self.cells.add(drawn.batch), drawn.pixels)
-        cells, found = cell_means(cells, squared_error.double().cpu().numpy() / 3)
+        cells, found = cell_means(cells, squared_error.cpu().double().numpy() / 3)
         self.cells.set(cells, KEPT * self.cells.values[cells] + (1 - KEPT) * found)

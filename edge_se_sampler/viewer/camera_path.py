@@ -41,7 +41,7 @@ class View:
         """About what one of our cameras sees: the principal point is in the middle."""
         height, width = int(cameras.height[k]), int(cameras.width[k])
         fov = 2 * math.atan(height / 2 / float(cameras.fy[k]))
-        return cls(cameras.camera_to_worlds[k].double().cpu().numpy(), fov, width / height)
+        return cls(cameras.camera_to_worlds[k].cpu().double().numpy(), fov, width / height)
 
     @property
     def wxyz(self) -> np.ndarray:

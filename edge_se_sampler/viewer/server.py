@@ -91,7 +91,7 @@ def start_server(address: ViewerConfig) -> Iterator[viser.ViserServer]:
 def set_initial_camera(server: viser.ViserServer, viewed: Viewed) -> tuple[np.ndarray, float]:
     """Begin at the first training camera, looking at what all of them look at; returns that point (3,), and how far it
     is from them, world units."""
-    focus, depth = find_focus(viewed.cameras.to("cpu", torch.float64))
+    focus, depth = find_focus(viewed.cameras.to("cpu").to(dtype=torch.float64))
     scale = max(float(np.median(np.abs(depth))), 1e-9)
     view, start = View.of_training(viewed.cameras, 0), server.initial_camera
     ahead = max(float(depth[0]), 0.1 * scale)

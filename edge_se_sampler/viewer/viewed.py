@@ -116,7 +116,7 @@ class Viewed:
     @property
     def up(self) -> np.ndarray:
         """(3,) unit vector: the scene's vertical."""
-        return find_up(self.cameras.to("cpu", torch.float64))
+        return find_up(self.cameras.to("cpu").to(dtype=torch.float64))
 
     def image(self, k: int, stride: int = 1) -> np.ndarray:
         """Every so many pixels, both ways, of the kth training image on the model's background, (H, W, 3) uint8."""
@@ -162,8 +162,8 @@ class Viewed:
         with self.turns:
             brick, cell = torch.nonzero(grid.occupied, as_tuple=True)
             within = torch.stack((cell // 16, cell // 4 % 4, cell % 4), dim=1)
-            centers = grid.aabb_min + (4 * grid.bricks[brick] + within + 0.5) * grid.cell_size
-        return _some(centers.cpu().numpy()), float(grid.cell_size)
+            centers = grid.aabb_min + (4 * grid.bricks[brick] + within + 0.5).cpu() * grid.cell_size
+        return _some(centers.numpy()), float(grid.cell_size)
 
     def hull_cells(self) -> tuple[np.ndarray, float] | None:
         """As `occupied_cells`, of those with which training began."""
