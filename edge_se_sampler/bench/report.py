@@ -96,6 +96,12 @@ def decimals(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
+def read_notes(folder: Path) -> str:
+    """An experiment's notes.md: remarks by hand, which no number shows."""
+    notes = folder / "notes.md"
+    return notes.read_text(encoding="utf-8").strip() if notes.exists() else ""
+
+
 def describe_machine(machine: Mapping[str, Any]) -> str:
     """Hardware and versions in a line."""
     versions = ", ".join(f"{name} {machine[name]}" for name in ("python", "torch", "numpy"))

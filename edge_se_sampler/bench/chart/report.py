@@ -14,7 +14,7 @@ from edge_se_sampler.bench.chart.summary import END, by_variant, comparable, mea
 from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
-from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
+from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.engine.figures import save_figure
 
@@ -33,9 +33,9 @@ def draw(folder: Path, workplace: Path | None) -> None:
 
 
 def describe(folder: Path) -> str:
-    """The README.md, of a single variant one of its own; notes.md has remarks by hand, which no number shows."""
+    """The README.md, of a single variant one of its own."""
     result, baselines, baseline_results = _read(folder)
-    runs, settings, notes = result["runs"], ChartSettings(**result["settings"]), folder / "notes.md"
+    runs, settings = result["runs"], ChartSettings(**result["settings"])
     groups = {group: _describe_group(runs, group, baselines) for group in GROUPS}
     variants = {run["variant"] for run in runs}
     return fill_template(
@@ -51,7 +51,7 @@ def describe(folder: Path) -> str:
         table="".join(groups.values()),
         failure_rule=FAILURE_RULE,
         every_scene=_compare_scenes(runs, baselines),
-        notes=notes.read_text(encoding="utf-8").strip() if notes.exists() else "",
+        notes=read_notes(folder),
         reproduce=describe_command(*baseline_results, result),
     )
 

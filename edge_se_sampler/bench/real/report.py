@@ -23,7 +23,7 @@ from edge_se_sampler.bench.real.summary import (
     psnr_by_budget,
     seconds_of,
 )
-from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
+from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.engine.figures import save_figure
 
@@ -53,6 +53,7 @@ def describe(folder: Path) -> str:
         gaps=_table_of(runs, {"test": "psnr", "SSIM": "ssim", "validation": "val_psnr", "training": "train_psnr"}),
         costs=_table_of_costs(runs),
         variants=_table_of_variants(result["runs"]),
+        notes=read_notes(folder),
         reproduce=describe_command(*baselines.values(), result),
     )
 

@@ -6,7 +6,7 @@ import statistics
 from pathlib import Path
 
 from edge_se_sampler.bench.outcomes import FAILURE_RULE
-from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
+from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.strategies.claims import CLAIMS
 from edge_se_sampler.bench.strategies.figures import draw_differences
@@ -57,6 +57,7 @@ def describe(folder: Path) -> str:
         best=_table_of_best(runs),
         panels="\n\n".join(f"### {label}\n\n{_table_of(runs, panel)}" for panel, label in labels_of(runs).items()),
         errors="\n".join(f"- {', '.join(map(str, error.values()))}" for error in result["errors"]),
+        notes=read_notes(folder),
         reproduce=describe_command(result),
     )
 
