@@ -159,9 +159,13 @@ def _is_optimizer(state: Any, optimizer: torch.optim.Optimizer) -> bool:
     ):
         return False
     for group, own_group in zip(state["param_groups"], own["param_groups"], strict=True):
-        if not all(group[key] == own_group[key] for key in group.keys() & own_group.keys() - {"lr"}):
+        same = group.keys() & own_group.keys() - {"lr", "fused"}
+        if not all(group[key] == own_group[key] for key in same):
             return False
-        if not (GROUP <= group.keys() <= own_group.keys() and is_finite(group["lr"]) and group["lr"] >= 0):
+        if not (group.keys() >= GROUP and is_finite(group["lr"]) and group["lr"] >= 0):
+            return False
+        switches = (group[key] for key in group.keys() - same - {"lr"})  # where torch's versions differ
+        if not all(value is None or isinstance(value, bool) for value in switches):
             return False
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     return isinstance(state["state"], dict) and all(
