@@ -177,6 +177,8 @@ def test_finished_trials_of_a_bench_stay(some: int | None, tmp_path: Path, disk:
     def run(folder: Path) -> None:
         run_experiment(toy_experiment(), folder, lambda: ThreadPoolExecutor(1))
 
+    disk.folder.mkdir()  # of all runs alike
+    disk.count = 0
     run(tmp_path / "disk" / "whole")
     whole = read_result(tmp_path / "disk" / "whole" / "result.json")["runs"]
     for number in moments(disk.count, some):

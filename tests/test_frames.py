@@ -160,6 +160,15 @@ def test_ctrl_c_keeps_what_is_whole(tmp_path: Path, checkpoint: Path, monkeypatc
     assert len(files(tmp_path / "out")) == 4
 
 
+def test_a_process_that_was_killed_at_its_first_file_leaves_a_folder_to_go_on_with(
+    tmp_path: Path, checkpoint: Path
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".frames.json.tmp").write_text('{"check')
+    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, checkpoint)
+    assert sorted(files(tmp_path / "out")) == ["frames.json", *(f"rgb/0000{i}.png" for i in range(3))]
+
+
 def moved() -> Cameras:
     poses = CAMERAS.camera_to_worlds.clone()
     poses[2, 0, 3] += 1e-3

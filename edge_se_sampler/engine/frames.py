@@ -109,7 +109,7 @@ def _claim(folder: Path, facts: dict[str, Any]) -> None:
     make_folder(folder, "--output-path")
     path = folder / "frames.json"
     if not path.exists():
-        if any(folder.iterdir()):
+        if any(entry.name != f".{path.name}.tmp" for entry in folder.iterdir()):  # which a killed process leaves
             raise InputError(f"--output-path {folder}: has other files, and no frames.json; name a new folder")
         write_json(path, facts)
         return
