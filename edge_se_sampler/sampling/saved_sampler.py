@@ -20,7 +20,7 @@ Sizes = Mapping[int, tuple[int, int]]
 
 
 def is_sampler_state(state: Mapping[str, Any], sampler: ImportantPixels, images: Sizes) -> bool:
-    """Whether a sampler of training images can continue from a state; parts of other packages judge theirs."""
+    """Whether a sampler of training images can continue from a state; parts of other packages judge their own."""
     parts, package = sampler.parts(), __name__.partition(".")[0]
     return state.keys() <= parts.keys() and all(
         _is_part(state.get(name, {}), part.state_dict(), images)

@@ -129,7 +129,7 @@ class SoftMining(LearnedDistribution):
         return torch.from_numpy(np.minimum(weight, weight.mean() + weight.std())).float()
 
     def update(self, drawn: PixelBatch, squared_error: Tensor, step: TrainingStep) -> None:
-        """Enter errors into the map, and tell the walkers theirs."""
+        """Enter errors into the map, and give each walker its own."""
         _, index = self.tables(drawn.batch)
         q = np.sqrt(squared_error.cpu().double().numpy() / 3)
         cells, found = cell_means(self.cells.cells_at(index, drawn.pixels), np.maximum(q, MIN_VALUE))
