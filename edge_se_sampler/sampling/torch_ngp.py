@@ -4,7 +4,7 @@ e   value of a cell of an image's 128 x 128: at first 1, then e <- 0.1 e + 0.9 x
     over the channels
 
 A cell is drawn in proportion to e (and to its size), a pixel in it uniformly. Decided here: an image of less than 128
-rows or columns has a cell for each; a pixel lies in one cell only, where torch-ngp's jitters over borders; draws are with
+rows or columns has a cell for each; a pixel lies in one cell only, where torch-ngp jitters over borders; draws are with
 replacement, and of several errors in a cell the mean counts.
 """
 
