@@ -113,6 +113,10 @@ class CallbackTrainer(Protocol):
         """The part of the training, in [0, 1], that is done when a step begins."""
         ...
 
+    def first_progress(self, step: int) -> float:
+        """The same of the training as first planned; making it longer does not change it."""
+        ...
+
 
 @dataclass(frozen=True)
 class TrainingCallbackAttributes:

@@ -48,6 +48,15 @@ def test_an_extended_run_goes_on_from_its_optimizers_state(run: Path) -> None:
     assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(trainer.config.preset.learning_rate * 0.1**0.2)
 
 
+def test_a_run_that_is_made_much_longer_does_not_begin_anew_with_edges(run: Path) -> None:
+    folder = RunFolder(run)
+    trainer = prepare_resume(folder, folder.config(method_configs()), max_num_iterations=600)
+    sampler = trainer.pipeline.datamanager.train_pixel_sampler
+    sampler.set_step(trainer.next_step)
+    assert (trainer.next_step, sampler.strategy) == (6, "se")
+    assert trainer.progress(6) == 0.01
+
+
 @pytest.mark.parametrize("length", [6, 3, 0])
 def test_a_run_is_not_made_shorter_than_it_is(run: Path, edge_se, length: int) -> None:
     config = (run / "config.json").read_bytes()

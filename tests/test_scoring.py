@@ -44,7 +44,7 @@ def test_candidates_are_scored_a_training_batch_at_a_time(candidates: int, rays:
 
 def attributes(planned: int, seed: int) -> Any:
     trainer = SimpleNamespace(
-        progress=Plan(planned).progress, config=SimpleNamespace(machine=SimpleNamespace(seed=seed))
+        first_progress=Plan(planned).progress, config=SimpleNamespace(machine=SimpleNamespace(seed=seed))
     )
     return SimpleNamespace(pipeline=SimpleNamespace(model=None), trainer=trainer)
 

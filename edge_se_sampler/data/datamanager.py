@@ -85,7 +85,7 @@ class VanillaDataManager:
             return []
         pipeline = training_callback_attributes.pipeline
         scorer = build_scorer(sampler, pipeline, self.cameras.pixel_rays, self.ray_errors)
-        sampler.bind(squared_error=scorer, progress=trainer.progress, seed=trainer.config.machine.seed)
+        sampler.bind(squared_error=scorer, progress=trainer.first_progress, seed=trainer.config.machine.seed)
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
 
     def ray_errors(self, model: Any, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> Tensor:

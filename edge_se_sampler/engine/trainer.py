@@ -49,6 +49,7 @@ class Trainer:
         self.config, self.run, self.pipeline, self.preview_picture = config, run, pipeline, preview
         num_steps = config.new_num_iterations or config.max_num_iterations
         self.plan = Plan(num_steps, config.segments or (), config.budget_seconds)
+        self.first_plan = Plan(config.max_num_iterations) if config.new_num_iterations else self.plan
         self.early_stopping = EarlyStopping(config.patience, config.min_gain)
         self.setup_seconds = setup_seconds
         self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset, config.optimizer)
@@ -72,6 +73,11 @@ class Trainer:
     def progress(self, step: int) -> float:
         """The part of the training, in [0, 1], that is done when a step begins."""
         return self.plan.progress(step)
+
+    def first_progress(self, step: int) -> float:
+        """The same of the training as first planned, at most 1: one that goes on for longer has no longer early phase,
+        nor another."""
+        return min(1.0, self.first_plan.progress(step))
 
     def _learning_rate_factor(self, step: int) -> float:
         return learning_rate_factor(self.config.optimizer, self.progress(step), step)
