@@ -10,6 +10,7 @@ from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 
+from edge_se_sampler import ranks
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.commands import COMMANDS
 from edge_se_sampler.errors import InputError
@@ -42,7 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _exit(message: str, code: int) -> NoReturn:
-    print(f"edge-se: {message}", file=sys.stderr)
+    print(f"edge-se: {message}", file=sys.stderr, flush=True)
+    if ranks.world_size() > 1:  # torch's threads, waiting for a rank that is gone, may abort a normal end
+        os._exit(code)
     sys.exit(code)
 
 
