@@ -69,12 +69,13 @@ def read(folder: Path) -> dict[str, Any]:
 # -- what is kept
 
 
-def test_result_json_holds_the_head_and_every_run_sorted(tmp_path: Path) -> None:
+def test_result_json_holds_the_head_and_every_run_sorted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy"])
     result = run_experiment(toy_experiment(trials=lambda _: TRIALS[::-1]), tmp_path / "new", one_thread)
     assert read_result(tmp_path / "new" / "result.json") == json.loads(json.dumps(result))
     assert result["runs"] == [{"scene": "mic", "seed": seed, "psnr": 20.0 + seed} for seed in range(3)]
     assert (result["version"], result["experiment"], result["settings"]) == (VERSION, "toy", {"steps": 3})
-    assert result["command"].startswith("edge-se ")
+    assert result["command"] == "edge-se bench toy"
     assert result["errors"] == []
 
 

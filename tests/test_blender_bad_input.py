@@ -54,13 +54,15 @@ def put(keys: str, value: object) -> Callable[[Doc], None]:
     return change
 
 
+def _name(value: Any) -> str:
+    """The same in every process."""
+    return "deleted" if value is DELETE else f"{str(value)[:25]!a}".replace("\\x00", "NUL")
+
+
 def bad(keys: str, *values: object, says: str, field: str = "") -> list[Any]:
     """Table rows: at `keys` each of `values`, refused for `field` with a message like `says`."""
     named = field or re.sub(r" (\d+)", r"[\1]", keys).replace(" ", ".")
-    return [
-        pytest.param(put(keys, value), named, says, id=f"{keys}={str(value)[:25]!a}".replace("\\x00", "NUL"))
-        for value in values
-    ]
+    return [pytest.param(put(keys, value), named, says, id=f"{keys}={_name(value)}") for value in values]
 
 
 def rotated(scale: float = 1, mirror: bool = False, last: tuple[float, ...] = (0, 0, 0, 1)) -> list[list[float]]:

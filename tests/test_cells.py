@@ -110,6 +110,34 @@ def test_an_image_whose_errors_are_all_zero_is_drawn_uniformly_and_a_masked_one_
     assert p_value(pixel_counts(drawn[:, 1:], (9, 14)), np.full((9, 14), 1 / 126)) > ALPHA
 
 
+@pytest.mark.parametrize("larger", [1.0, 1e30])
+def test_an_image_without_errors_is_drawn_uniformly_however_large_those_of_others_are(larger: float) -> None:
+    sizes = [(12, 10)] * 3
+    table = CellTable(10)  # several blocks an image
+    indices = table.add(images(sizes, masked=False))
+    table.values[:] = larger
+    table.values[table.first[1] : table.first[2]] = 0
+    table.refresh()
+    drawn = table.draw(indices, DRAWS, stream(0, 0, Stream.PIXELS))
+    counts = [pixel_counts(drawn[drawn[:, 0] == k, 1:], sizes[k]).ravel() for k in range(3)]
+    assert p_value(np.concatenate(counts), np.full(360, 1 / 360)) > ALPHA
+    np.testing.assert_allclose(table.density_ratio(indices, drawn).numpy(), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
+def test_values_that_are_not_finite_are_refused_before_they_are_drawn_from(value: float) -> None:
+    table = CellTable(4)
+    table.add(images(SAME, masked=True))
+    before = table.values.copy()
+    with pytest.raises(FloatingPointError, match="1 of 2 cells"):
+        table.set(np.arange(2), np.array([1.0, value]))
+    assert np.array_equal(table.values, before)
+    with np.errstate(over="ignore"):
+        table.values[3] = value
+    with pytest.raises(FloatingPointError, match="not finite"):
+        table.refresh()
+
+
 def test_of_several_errors_in_a_cell_the_mean_counts() -> None:
     cells, means = cell_means(np.array([5, 2, 5]), np.array([1.0, 7.0, 2.0]))
     assert (cells.tolist(), means.tolist()) == ([2, 5], [7.0, 1.5])

@@ -103,6 +103,7 @@ def test_a_run_is_evaluated_at_the_size_that_it_was_trained_at(tmp_path: Path) -
     assert iio.imread(pictures / "0000.png").shape == (2, 2 * 3, 3)  # the truth beside the rendering
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("EDGE_SE_SCENES" not in os.environ, reason="EDGE_SE_SCENES names no folder of real scenes")
 def test_a_real_scene_is_scaled_down() -> None:
     scene = Path(os.environ["EDGE_SE_SCENES"]) / "lego"

@@ -165,7 +165,7 @@ def test_a_cell_around_a_camera_straddles_its_plane() -> None:
 # -- nothing that is seen goes
 
 
-@pytest.mark.parametrize("size", [100, 800])
+@pytest.mark.parametrize("size", [100, pytest.param(800, marks=pytest.mark.slow)])
 def test_no_foreground_pixel_loses_its_cells(size: int) -> None:
     views = views_of(rods(), size, 12 if size == 100 else 4)
     hull = hull_of(views, 1.6 if size == 100 else 6)

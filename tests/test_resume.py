@@ -102,7 +102,7 @@ def state(run: Path) -> dict[str, bytes | float | str]:
     [
         ("edge-se-nerf", 8),  # in the edge phase
         pytest.param("edge-se-nerf", 16, marks=pytest.mark.slow),  # in the SE phase
-        ("lean-nerf without alpha", 12),  # with alpha: test_lean_cells
+        pytest.param("lean-nerf without alpha", 12, marks=pytest.mark.slow),  # with alpha: test_lean_cells
     ],
 )
 def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, interrupt_at: int):

@@ -229,7 +229,7 @@ def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
                 time.sleep(0.01)
             time.sleep(0.15)
         os.killpg(process.pid, signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=120)
     assert out.splitlines()[-1] == "stopped"
     assert err == ""
     assert process.returncode == 0

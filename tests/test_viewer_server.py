@@ -128,10 +128,10 @@ def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, 
         found = re.search(r"http://127\.0\.0\.1:(\d+)", process.stdout.readline())
         assert found is not None
         assert int(found[1]) > 0
-        page = urllib.request.urlopen(found[0], timeout=10).read()
+        page = urllib.request.urlopen(found[0], timeout=60).read()
         assert b"<html" in page.lower()
         if trains:
             wait_until(lambda: "goes on until Ctrl-C" in process.stdout.readline())  # type: ignore[union-attr]
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=120)
     assert (process.returncode, out, err) == (0, "", "")

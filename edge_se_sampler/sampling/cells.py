@@ -98,20 +98,23 @@ class CellTable:
         self.first = self._first_block * BLOCK
 
     def refresh(self) -> None:
-        """Follow changes of `values` anywhere."""
-        np.maximum(self.values, MIN_VALUE, out=self.values)
+        """Follow changes of `values` anywhere; raises as `set`."""
+        self.values = _checked(self.values)
         self._mass = np.zeros(len(self.values) // BLOCK)
         self._sum_blocks(np.arange(len(self._mass)))
         self._support = np.add.reduceat(self.counts, self.first[:-1]) if len(self) else np.zeros(0, dtype=np.int64)
 
     def set(self, cells: np.ndarray, values: np.ndarray) -> None:
-        """Change the values of some cells, at most once each."""
-        self.values[cells] = np.maximum(values, MIN_VALUE)
+        """Change the values of some cells, at most once each. FloatingPointError: one is not finite in float32."""
+        self.values[cells] = _checked(values)
         self._sum_blocks(np.unique(cells // BLOCK))
 
     def _sum_blocks(self, blocks: np.ndarray) -> None:
         self._mass[blocks] = self._weights(blocks).sum(axis=1)
-        self._cumulative = np.concatenate(([0.0], self._mass.cumsum()))
+        self._image_mass = np.add.reduceat(self._mass, self._first_block[:-1]) if len(self) else np.zeros(0)
+        # of shares: in one sum of masses, images with large values would round away those of others
+        share = self._mass / np.maximum(np.repeat(self._image_mass, np.diff(self._first_block)), MIN_VALUE)
+        self._cumulative = np.concatenate(([0.0], share.cumsum()))
 
     def _weights(self, blocks: np.ndarray) -> np.ndarray:
         """(n, BLOCK) float64 masses of the cells of n blocks."""
@@ -139,10 +142,6 @@ class CellTable:
         bit = np.where(first >= 0, first + pixel[..., 0] * self.size[image, 1] + pixel[..., 1], 0)
         return (first < 0) | (self._bits[bit >> 3] >> (7 - (bit & 7)).astype(np.uint8) & 1 > 0)
 
-    def _image_masses(self, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        low = self._cumulative[self._first_block[images]]
-        return low, self._cumulative[self._first_block[images + 1]] - low
-
     def drawable(self, images: Tensor) -> Tensor:
         """(k,) bool: the images that have a pixel to draw."""
         return torch.from_numpy(self._support[images.numpy()] > 0)
@@ -154,15 +153,16 @@ class CellTable:
             images: (k,) int64, indices of images in this table; all `drawable`.
         """
         indices, u = images.numpy(), rng.random((3, n)) * (1 - 2.0**-36)  # less than 1 after rounding, too
-        low, mass = self._image_masses(indices)
+        low = self._cumulative[self._first_block[indices]]
+        share = self._cumulative[self._first_block[indices + 1]] - low
         if self.across_images:
-            cumulative = mass.cumsum()
+            cumulative = self._image_mass[indices].cumsum()
             which = np.searchsorted(cumulative, u[0] * cumulative[-1], side="right")
         else:
             which = (u[0] * len(indices)).astype(np.int64)
-        block = np.searchsorted(self._cumulative[1:], low[which] + u[1] * mass[which], side="right")
+        block = np.searchsorted(self._cumulative[1:], low[which] + u[1] * share[which], side="right")
         first, end = self._first_block[indices[which]], self._first_block[indices[which] + 1]
-        for i in np.flatnonzero((block < first) | (block >= end)):  # rounding: other images have much larger values
+        for i in np.flatnonzero((block < first) | (block >= end)):  # rounding
             block[i] = first[i] + self._mass[first[i] : end[i]].argmax()
         weights = self._weights(block).cumsum(axis=1)
         cell = BLOCK * block + (weights <= (u[2] * weights[:, -1])[:, None]).sum(axis=1)
@@ -196,7 +196,7 @@ class CellTable:
     def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) float64 p of drawn pixels over that under uniform sampling, image first, pixel second."""
         indices, which = images.numpy(), drawn[:, 0].numpy()
-        _, mass = self._image_masses(indices)
+        mass = self._image_mass[indices]
         per_image = np.full(len(mass), mass.sum() / len(mass)) if self.across_images else mass
         scale = self._support[indices] / np.maximum(per_image, MIN_VALUE)
         return torch.from_numpy(self.values[self.cells_at(images, drawn)] * scale[which])
@@ -215,6 +215,15 @@ class CellTable:
         table.values = state["values"].numpy().copy()
         table.refresh()
         return table
+
+
+def _checked(values: np.ndarray) -> np.ndarray:
+    """As float32, none below MIN_VALUE; FloatingPointError unless all are finite."""
+    with np.errstate(over="ignore"):
+        checked = np.maximum(values, MIN_VALUE).astype(np.float32)
+    if bad := np.count_nonzero(~np.isfinite(checked)):
+        raise FloatingPointError(f"the errors of {bad} of {len(checked)} cells are not finite")
+    return checked
 
 
 def cell_means(cells: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
