@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 
 from edge_se_sampler.bench.baselines.run import BaselineSettings, Clock, TimeIsUp, mean_psnr, read_baselines, train
 from edge_se_sampler.bench.chart.trials import ChartSettings
+from edge_se_sampler.bench.nerfstudio import host
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.errors import InputError
 
@@ -171,6 +174,47 @@ def test_a_program_whose_evaluation_needs_a_gpu_is_evaluated_without(data: Path,
     run = train(settings, checkout(tmp_path / "program", "train.py", TENSORF), data, seed=0)
     ((_, psnr),) = run["curve"]
     assert psnr == pytest.approx(mean_psnr([np.ones((24, 24, 3), np.float32)], data), abs=1e-3)
+
+
+def test_nerfstudio_is_looked_at_between_steps_and_downloads_no_weights(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def download(**_: Any) -> None:
+        raise OSError("no network")
+
+    def build_trainer(config: tuple[Any, ...], test_mode: str) -> Any:
+        assert config[:2] == ("nerfacto", 7)
+        assert config[-1] == ["--rays", "8"]
+        assert test_mode == "test"
+        metrics.LearnedPerceptualImagePatchSimilarity(normalize=True)
+        trainer = SimpleNamespace(pipeline=SimpleNamespace(datamanager=None), callbacks=[], step=0)
+
+        def train_on() -> None:
+            for trainer.step in range(10**6):
+                trainer.callbacks[0](trainer.step)
+
+        trainer.train = train_on
+        return trainer
+
+    callbacks: Any = ModuleType("nerfstudio.engine.callbacks")
+    callbacks.TrainingCallback = lambda _, evaluate: evaluate
+    callbacks.TrainingCallbackLocation = SimpleNamespace(AFTER_TRAIN_ITERATION=0)
+    metrics: Any = ModuleType("torchmetrics.image.lpip")
+    metrics.LearnedPerceptualImagePatchSimilarity = download
+    for module in (callbacks, metrics):
+        parts = module.__name__.split(".")
+        for depth in range(1, len(parts)):
+            monkeypatch.setitem(sys.modules, ".".join(parts[:depth]), ModuleType(parts[0]))
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(host, "build_config", lambda *options: options)
+    monkeypatch.setattr(host, "build_trainer", build_trainer)
+    monkeypatch.setattr(host, "render_test_views", lambda trainer: [np.full((24, 24, 3), trainer.step > 0, np.float32)])
+    settings = BaselineSettings(
+        seconds=0.2, threads=2, program="nerfstudio-nerfacto", program_version="1", flags="--rays 8"
+    )
+    run = train(settings, None, data, 7, (0.0, 0.1))
+    assert [seconds for seconds, _ in run["curve"][1:]] == [pytest.approx(s, abs=0.09) for s in (0.1, 0.2)]
+    assert run["curve"][0][1] < run["curve"][1][1] == run["curve"][2][1]
 
 
 # -- their files

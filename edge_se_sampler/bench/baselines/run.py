@@ -195,6 +195,9 @@ def _nerfstudio(method: str, clock: Clock, data: Path, folder: Path, seed: int, 
 
     from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
 
+    # only its own evaluation, which is not called, has a use for LPIPS, whose weights it would download
+    metrics: Any = importlib.import_module("torchmetrics.image.lpip")
+    metrics.LearnedPerceptualImagePatchSimilarity = torch.nn.Identity
     config = build_config(method, seed, data, folder, flags)
     clock.start()
     trainer = build_trainer(config, "test")
