@@ -70,8 +70,8 @@ def _read_motion(matrix: JsonValue) -> np.ndarray:
     rows = [row.list() for row in matrix.list()]
     if [len(row) for row in rows] != [4, 4, 4]:
         raise matrix.location.error(f"must be 3 rows of 4 numbers, not {quote(matrix.value)}", "take nerfstudio's file")
-    last = [JsonValue(value, matrix.location) for value in (0, 0, 0, 1)]
-    return np.vstack((rigid_pose(matrix, [*sum(rows, []), *last]), (0, 0, 0, 1)))
+    rows.append([JsonValue(value, matrix.location) for value in (0, 0, 0, 1)])
+    return np.vstack((rigid_pose(matrix, [entry for row in rows for entry in row]), (0, 0, 0, 1)))
 
 
 def _read_side(top: JsonValue, key: str) -> int:

@@ -43,7 +43,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     ranks.join(device)
     views = read_train_views(config)
     held_out = _read_first_split(config, ("val", "test"))
-    preview = None if held_out is None else first_picture(held_out)
+    preview = None if held_out is None else _first_picture(held_out)
     check_value(
         "patience", config.patience, config.patience is None or preview is not None, "left out: no view is held out"
     )
@@ -150,7 +150,7 @@ def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views |
     return next((views for views in found if views is not None), None)
 
 
-def first_picture(views: Views) -> Picture:
+def _first_picture(views: Views) -> Picture:
     """The first view of which some pixels are known, without converting the others."""
     return next(picture for i in range(len(views.names)) for picture in to_pictures(views.subset([i])))
 

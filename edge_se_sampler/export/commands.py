@@ -25,8 +25,10 @@ class ExportMesh:
     tolerance: float = 0.0
     """How far the surface may move, in cells, to get along with fewer faces; 0: it keeps them all."""
     picture: Path | None = None
-    """A PNG to write as well: the first held-out image, the run's rendering of it, and there the mesh, in its colors
-    and lit from the camera. How far the mesh is from the depth that is rendered is told."""
+    """A PNG to write as well: a held-out image, the run's rendering of it, and there the mesh, in its colors and lit
+    from the camera. How far the mesh is from the depth that is rendered is told."""
+    picture_view: int = 0
+    """Which of the held-out images that is."""
 
     def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.mesh import export_mesh

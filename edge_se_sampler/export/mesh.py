@@ -12,15 +12,15 @@ import torch
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, to_uint8, write_atomically
+from edge_se_sampler.engine.files import to_uint8, write_atomically
 from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import first_picture, load_model, read_test_views, read_train_views
+from edge_se_sampler.engine.session import load_model, read_train_views
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.export.density import find_density
-from edge_se_sampler.export.picture import write_comparison
+from edge_se_sampler.export.picture import read_compared, write_comparison
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.export.surface import find_surface, keep_largest, simplify
 from edge_se_sampler.models.ray_model import RayModel
@@ -40,6 +40,7 @@ def export_mesh(
     keep_components: int,
     tolerance: float,
     picture: Path | None,
+    picture_view: int,
 ) -> str:
     """Write the surface at which a cell has that opacity across; returns what there is to say about it. InputError if a
     value is out of its range, a file cannot be written, or nothing is as opaque."""
@@ -47,20 +48,20 @@ def export_mesh(
     check_value("keep-components", keep_components, keep_components >= 0, "at least 0")
     check_value("tolerance", tolerance, 0 <= tolerance < math.inf, "at least 0")
     check_export(output_path, ".ply", ".glb")
-    if picture is not None:
-        check_output(picture, "--picture")
-    view = None if picture is None else first_picture(read_test_views(config))
+    compared = None if picture is None else read_compared(config, picture, picture_view)
     import trimesh
 
     model, _ = load_model(run, config)
     grid, density = find_density(model, opacity_threshold, partial(analyze_box, config))
     cell_size = float(grid.cell_size)
-    vertices, triangles = keep_largest(*find_surface(grid, density), keep_components)
+    vertices, triangles = find_surface(grid, density)
     if not len(triangles):
         problem = f"--opacity-threshold is {opacity_threshold}: nothing is as opaque"
         raise InputError(f"{problem}; give less, or train for longer")
+    vertices, triangles = keep_largest(vertices, triangles, keep_components)
     if tolerance:
         vertices, triangles = simplify(vertices, triangles, tolerance * cell_size)
+        check_value("tolerance", tolerance, len(triangles) > 0, "less: the whole surface is no larger")
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     normals = np.array(mesh.vertex_normals)
     colors = render_colors(model, vertices, normals, CELLS_BEFORE * cell_size)
@@ -70,9 +71,9 @@ def export_mesh(
         write_ply(output_path, point_columns(vertices, normals) | color_columns(to_uint8(colors)), triangles)
     closed = "watertight" if mesh.is_watertight else "not watertight"
     report = describe_file(output_path, f"{len(vertices):,} vertices, {len(triangles):,} faces, {closed}")
-    if picture is None or view is None:
+    if picture is None or compared is None:
         return report
-    return f"{report}\n{write_comparison(picture, model, view, mesh, colors)}"
+    return f"{report}\n{write_comparison(picture, model, compared, mesh, colors)}"
 
 
 def analyze_box(config: TrainerConfig) -> BrickGrid:

@@ -9,9 +9,12 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.engine.files import write_image
+from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.files import check_output, write_image
 from edge_se_sampler.engine.metrics import composite_on
-from edge_se_sampler.engine.rendering import Picture, render_opaque
+from edge_se_sampler.engine.rendering import Picture, render_opaque, to_pictures
+from edge_se_sampler.engine.session import read_test_views
+from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.ray_model import RayModel
 
 PIXELS_AT_ONCE = 2**22
@@ -21,9 +24,19 @@ SEEN = 0.5
 """Accumulation above which there is something whose depth is known."""
 
 
+def read_compared(config: TrainerConfig, path: Path, view: int) -> Picture:
+    """The held-out view of that number; InputError if there is none, or the file cannot be written."""
+    if path.suffix.lower() != ".png":
+        raise InputError(f"--picture {path}: must end in .png")
+    check_output(path, "--picture")
+    pictures = to_pictures(read_test_views(config))
+    check_value("picture-view", view, 0 <= view < len(pictures), f"between 0 and {len(pictures) - 1}")
+    return pictures[view]
+
+
 def write_comparison(path: Path, model: RayModel, picture: Picture, mesh: Any, colors: np.ndarray) -> str:
-    """Write a row of four images: a view, its rendering, and the mesh there, in its vertices' colors (v, 3) in [0, 1] and
-    lit from the camera. Returns a line on how far the mesh is from the depth that is rendered."""
+    """Write a row of four images: a view, its rendering, and the mesh there, in its vertices' colors (v, 3) in [0, 1]
+    and lit from the camera. Returns a line on how far the mesh is from the depth that is rendered."""
     image, camera, background = picture.image, picture.camera, model.config.background_level
     size = image.shape[:2]
     rays = picture.rays(model.device)

@@ -1,0 +1,91 @@
+"""Meshes of dense networks, which have no cells of their own: of a ball whose density is known, and of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exported import CELL, OPACITY, RADIUS, color_at
+from tiny import ball_views, tiny_model
+
+from edge_se_sampler.engine.pipeline import analyze_views
+from edge_se_sampler.export import density
+from edge_se_sampler.export.density import find_density
+from edge_se_sampler.export.mesh import render_colors
+from edge_se_sampler.export.surface import find_surface
+from edge_se_sampler.occupancy.bricks import BrickGrid
+
+trimesh = pytest.importorskip("trimesh")
+for package in ("manifold3d", "skimage"):
+    pytest.importorskip(package)
+
+
+class DenseBall(torch.nn.Module):
+    """A field in whose density a cell of CELL has an opacity of OPACITY at a radius; e^2 times as much a CELL deeper."""
+
+    def __init__(self, radius: float) -> None:
+        super().__init__()
+        self.radius, self.num_evaluated = radius, 0
+        self.weight = torch.nn.Parameter(torch.zeros(()))  # tells the model's device and type
+
+    def forward(self, positions: torch.Tensor, directions: torch.Tensor, *_: object):
+        self.num_evaluated += len(positions)
+        density = -np.log(1 - OPACITY) / CELL * torch.exp(2 * (self.radius - positions.norm(dim=1)) / CELL)
+        return density, torch.from_numpy(color_at(positions.double().numpy())).to(positions)
+
+
+def ball(grid: BrickGrid | None = None, radius: float = RADIUS):
+    model = tiny_model(grid=grid, near=2.0, far=6.0, num_coarse_samples=64, num_importance_samples=64).float()
+    model.fine = model.coarse = DenseBall(radius)
+    return model.eval()
+
+
+def find_box() -> BrickGrid:
+    return analyze_views(ball_views(6, 24, RADIUS), ball().config).grid()
+
+
+def test_the_surface_is_where_density_passes_the_threshold() -> None:
+    """In cells that are found by halving those of the box that the views see, where these are dense."""
+    model, box = ball(), find_box()
+    grid, difference = find_density(model, OPACITY, find_box)
+    assert grid.level == grid.max_level >= 2
+    mesh = trimesh.Trimesh(*find_surface(grid, difference), process=False)
+    assert mesh.is_watertight
+    # half as large cells need twice as much density to be as opaque
+    radius = RADIUS + CELL / 2 * np.log(float(grid.cell_size) / CELL)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - radius).max() < 0.2 * float(grid.cell_size)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05)
+    assert model.fine.num_evaluated < 0.5 * int(box.occupied.sum()) * 8 ** int(grid.max_level)
+    colors = render_colors(model, mesh.vertices, mesh.vertex_normals, 2 * float(grid.cell_size))
+    np.testing.assert_allclose(colors, color_at(mesh.vertices), atol=0.03)
+
+
+def test_a_network_with_cells_is_evaluated_in_these_alone() -> None:
+    cells = torch.ones((12, 12, 12), dtype=torch.bool)
+    cells[:6] = False
+    grid = BrickGrid.from_cells(torch.full((3,), -0.9), 0.15, cells, max_level=1)
+    mesh = trimesh.Trimesh(*find_surface(*find_density(ball(grid), OPACITY, find_box)), process=False)
+    assert mesh.is_watertight
+    assert mesh.vertices[:, 0].min() > -0.0376
+    assert mesh.vertices[:, 0].max() == pytest.approx(RADIUS, abs=0.0375)
+
+
+def test_an_empty_network_has_no_surface() -> None:
+    assert not len(find_surface(*find_density(ball(radius=-9.0), OPACITY, find_box))[1])
+
+
+def test_cells_stay_large_where_there_would_be_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(density, "MAX_ROWS", find_box().num_rows)
+    grid, _ = find_density(ball(), OPACITY, find_box)
+    assert grid.level < grid.max_level
+    assert grid.num_rows <= find_box().num_rows
+
+
+def test_a_run_has_a_mesh(run: Path, tmp_path: Path, edge_se: Callable) -> None:
+    path = tmp_path / "mesh.ply"
+    answer = edge_se("export", run, "mesh", "--output-path", path, "--opacity-threshold", 1e-6)
+    assert answer.code == 0, answer.err
+    assert trimesh.load(path, process=False).is_watertight
