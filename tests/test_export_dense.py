@@ -24,7 +24,7 @@ for package in ("manifold3d", "skimage"):
 
 
 class DenseBall(torch.nn.Module):
-    """A field in whose density a cell of CELL has an opacity of OPACITY at a radius; e^2 times as much a CELL deeper."""
+    """A field in which a CELL has an opacity of OPACITY at a radius; a CELL deeper, density is e^2 times as high."""
 
     def __init__(self, radius: float) -> None:
         super().__init__()

@@ -156,7 +156,7 @@ def test_a_simplified_surface_has_moved_by_no_more_than_the_tolerance() -> None:
 def test_a_rough_surface_stays_closed(seed: int) -> None:
     """Full of handles and holes, as of a short training."""
     grid = BrickGrid.from_cells(torch.zeros(3), 1.0, torch.ones((20, 20, 20), dtype=torch.bool))
-    values = np.random.default_rng(seed).normal(size=grid.num_rows)
+    values = np.random.default_rng(seed).normal(size=grid.num_rows).astype(np.float32)
     vertices, triangles = find_surface(grid, torch.from_numpy(values))
     mesh = mesh_of(*simplify(vertices, triangles, 0.5))
     assert mesh_of(vertices, triangles).is_watertight

@@ -26,7 +26,7 @@ def find_surface(grid: BrickGrid, difference: Tensor) -> tuple[np.ndarray, np.nd
     nothing is positive."""
     from skimage.measure import marching_cubes
 
-    difference = difference.cpu()
+    difference = difference.float().cpu()
     away = difference.abs().clamp(LEAST_DIFFERENCE, MAX_DIFFERENCE)
     difference = torch.where(difference < 0, -away, away)
     numbers = F.pad(grid.numbers.cpu(), (1, 1) * 3, value=-1)  # bricks of nothing around the box
