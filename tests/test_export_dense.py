@@ -8,14 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from exported import CELL, OPACITY, RADIUS, color_at
+from exported import CELL, OPACITY, RADIUS, ball_run, color_at
 from tiny import ball_views, tiny_model
 
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.pipeline import analyze_views
+from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.export import density
 from edge_se_sampler.export.density import find_density
-from edge_se_sampler.export.mesh import render_colors
+from edge_se_sampler.export.mesh import analyze_box, render_colors
 from edge_se_sampler.export.surface import find_surface
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.occupancy.bricks import BrickGrid
 
 trimesh = pytest.importorskip("trimesh")
@@ -82,6 +86,15 @@ def test_cells_stay_large_where_there_would_be_too_many(monkeypatch: pytest.Monk
     grid, _ = find_density(ball(), OPACITY, find_box)
     assert grid.level < grid.max_level
     assert grid.num_rows <= find_box().num_rows
+
+
+def test_the_box_of_a_run_is_carved_by_silhouettes(tmp_path: Path) -> None:
+    """Outside of them a dense network may have learned anything that looks like the background."""
+    ball_run(tmp_path)
+    config = override(method_configs()["edge-se-nerf"], {"data": tmp_path / "scene"})
+    grid = analyze_box(resolve_config(config, read_blender(tmp_path / "scene", "train")))
+    volume = float(grid.occupied.sum() * grid.cell_size**3)
+    assert 1 < volume / (4 / 3 * np.pi * RADIUS**3) < 6  # in large cells
 
 
 def test_a_run_has_a_mesh(run: Path, tmp_path: Path, edge_se: Callable) -> None:

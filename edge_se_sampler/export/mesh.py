@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,8 +78,9 @@ def export_mesh(
 
 
 def analyze_box(config: TrainerConfig) -> BrickGrid:
-    """The cells of the box that a run's training views see."""
-    return analyze_views(read_train_views(config), config.pipeline.model).grid()
+    """The cells that may hold something by a run's training views: a dense network without cells may have learned
+    anything that looks like the background outside of silhouettes."""
+    return analyze_views(read_train_views(config), replace(config.pipeline.model, empty_space_skipping=True)).grid()
 
 
 def render_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:
