@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ class DenseBall(torch.nn.Module):
 
 
 def ball(grid: BrickGrid | None = None, radius: float = RADIUS):
-    model = tiny_model(grid=grid, near=2.0, far=6.0, num_coarse_samples=64, num_importance_samples=64).float()
+    model: Any = tiny_model(grid=grid, near=2.0, far=6.0, num_coarse_samples=64, num_importance_samples=64).float()
     model.fine = model.coarse = DenseBall(radius)
     return model.eval()
 
