@@ -23,7 +23,7 @@ class ExportMesh:
     keep_components: int = 1
     """How many of the surface's connected parts are kept, the largest first; 0: all."""
     tolerance: float = 0.0
-    """How far the surface may move, in cells, to get along with fewer faces; 0: it keeps them all."""
+    """How far the surface may move, in cells, to have fewer faces, and coarser colors; 0: it keeps all."""
     picture: Path | None = None
     """A PNG to write as well: a held-out image, the run's rendering of it, and there the mesh, in its colors and lit
     from the camera. How far the mesh is from the depth that is rendered is told."""

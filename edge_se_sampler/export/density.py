@@ -14,7 +14,7 @@ from edge_se_sampler.models.lean import LeanModel
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.models.voxel_ops import find_dense_cells
-from edge_se_sampler.occupancy.bricks import BRICK, BrickGrid, unpack_bits
+from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
 MAX_ROWS = 2**23
 """Of the bricks of cells for which a dense network is evaluated: more would take long."""
@@ -36,7 +36,7 @@ def find_density(model: RayModel, opacity: float, find_box: Callable[[], BrickGr
     grid = find_box().to(model.device) if model.grid is None else model.grid
     while True:
         difference = _evaluate(model, grid) + (math.log(float(grid.cell_size)) - threshold)
-        if grid.level == grid.max_level or not (difference > 0).any():
+        if grid.level == grid.max_level:
             return grid, difference
         dense = unpack_bits(find_dense_cells(grid, difference[:, None], 0.0)).reshape(-1)
         finer = grid.subdivide(grid.to_cells(dense), float(grid.cell_size) / 2)
@@ -54,9 +54,7 @@ def _evaluate(model: NeRFModel, grid: BrickGrid) -> Tensor:
     done = 0
     with Progress(len(rows), "evaluating density") as progress:
         for some in rows.split(POINTS_PER_CHUNK.get(model.device.type, 2**14)):
-            within = torch.stack((some // 16 % BRICK, some // 4 % BRICK, some % BRICK), dim=1)
-            corners = (BRICK * grid.bricks[some // BRICK**3] + within).cpu()
-            positions = (grid.aabb_min + corners * grid.cell_size).to(result)
+            positions = (grid.aabb_min + grid.coordinates(some).cpu() * grid.cell_size).to(result)
             result[some] = model.fine(positions, any_direction, None)[0].log()
             done += len(some)
             progress.update(done)

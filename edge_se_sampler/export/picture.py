@@ -11,6 +11,7 @@ import torch
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, write_image
+from edge_se_sampler.engine.frames import SEEN
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.rendering import Picture, render_opaque, to_pictures
 from edge_se_sampler.engine.session import read_test_views
@@ -20,8 +21,6 @@ from edge_se_sampler.models.ray_model import RayModel
 PIXELS_AT_ONCE = 2**22
 AMBIENT = 0.15
 """Light on what is seen edge-on; 1 is on what faces the camera."""
-SEEN = 0.5
-"""Accumulation above which there is something whose depth is known."""
 
 
 def read_compared(config: TrainerConfig, path: Path, view: int) -> Picture:
