@@ -103,6 +103,9 @@ class Render(_RunCommand):
     the default); a path through the training views in their order; the training views; the held-out ones."""
     camera_path: Path | None = None
     """Cameras of nerfstudio's viewer (camera_path.json) in place of a kind, in the units and axes of the run's data."""
+    dataparser_transforms: Path | None = None
+    """The dataparser_transforms.json of a run of nerfstudio on the same data: the camera path is in that run's units
+    and axes."""
     num_frames: int = 60
     """Frames of spiral and interpolate."""
     frames_per_second: float | None = None

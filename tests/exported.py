@@ -15,6 +15,8 @@ from edge_se_sampler.engine.checkpoint import save_checkpoint
 from edge_se_sampler.engine.config import MODEL, override
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.session import resolve_config
+from edge_se_sampler.export.density import find_density
+from edge_se_sampler.export.surface import find_surface
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import LeanModel
@@ -84,6 +86,11 @@ def ball_run(folder: Path, scale: float = 1.0, size: int = 48, empty: bool = Fal
     state |= {"plan": {}, "scheduler": {}, "sampler": {}, "optimizer": None, "dead_network_reset": None}
     save_checkpoint(run.checkpoints, 0, state)
     return run.path
+
+
+def surface_of(model: LeanModel, opacity: float = OPACITY) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles at which a cell has that opacity."""
+    return find_surface(*find_density(model, opacity, find_box=lambda: model.grid))
 
 
 def color_at(positions: np.ndarray) -> np.ndarray:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from capture_folder import write_colmap, write_transforms
 
-from edge_se_sampler.data.camera_path import read_camera_path
+from edge_se_sampler.data.camera_path import CameraPath, read_camera_path, undo_dataparser
 from edge_se_sampler.errors import InputError
 
 TURN = [0, -1, 0, 5, 1, 0, 0, 6, 0, 0, 1, 7, 0, 0, 0, 1]  # x of the camera is y of the world
@@ -130,3 +131,77 @@ def test_nerfstudio_means_the_same_cameras(tmp_path: Path) -> None:
     torch.testing.assert_close(theirs.camera_to_worlds, ours.camera_to_worlds, check_dtype=False)
     for key in ("fx", "fy", "cx", "cy"):
         torch.testing.assert_close(getattr(theirs, key), getattr(ours, key), check_dtype=False)
+
+
+MOTION = np.array([[0.0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.7]])
+"""From the data to nerfstudio, before it is scaled."""
+APPLIED = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 2], [0, 0, -1, -1]])
+"""From the original data to the json's."""
+
+
+def square(motion: np.ndarray) -> np.ndarray:
+    return np.vstack((motion, (0, 0, 0, 1)))
+
+
+def drawn_path(folder: Path, scale: float = 0.25) -> CameraPath:
+    """The path of `path_json`, as it is drawn in nerfstudio's viewer."""
+    content = path_json()
+    for camera in content["camera_path"]:
+        pose = square(MOTION) @ np.reshape(camera["camera_to_world"], (4, 4))
+        pose[:3, 3] *= scale
+        camera["camera_to_world"] = pose.ravel().tolist()
+    return read_camera_path(write(folder, content))
+
+
+def write_dataparser(folder: Path, motion: Any = MOTION, scale: float = 0.25) -> Path:
+    path = folder / "dataparser_transforms.json"
+    path.write_text(json.dumps({"transform": np.array(motion).tolist(), "scale": scale}))
+    return path
+
+
+@pytest.mark.parametrize("applied", [None, "written", "old COLMAP"])
+def test_a_path_drawn_in_nerfstudio_returns_to_the_data(applied: str | None, tmp_path: Path) -> None:
+    """With what nerfstudio's own json says of the data before it, which its file takes together with its own motion."""
+    scene = write_transforms(tmp_path / "scene")
+    motion, scale = MOTION, 0.25
+    if applied == "written":
+        scene |= {"applied_transform": APPLIED.tolist(), "applied_scale": 3.0}
+        (tmp_path / "scene" / "transforms.json").write_text(json.dumps(scene))
+        motion, scale = MOTION @ square(APPLIED), 0.75
+    elif applied == "old COLMAP":
+        (tmp_path / "scene" / "colmap" / "sparse" / "0").mkdir(parents=True)
+        motion = MOTION @ np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    path = drawn_path(tmp_path)
+    found = undo_dataparser(path, write_dataparser(tmp_path, motion, scale), tmp_path / "scene", "auto")
+    expected = read_camera_path(write(tmp_path, path_json()))
+    torch.testing.assert_close(found.cameras.camera_to_worlds, expected.cameras.camera_to_worlds)
+    assert found.frames_per_second == 24
+    assert torch.equal(found.cameras.fx, expected.cameras.fx)
+
+
+def test_what_another_json_says_of_data_in_colmaps_format_does_not_count(tmp_path: Path) -> None:
+    """nerfstudio's file is of COLMAP's own world, which is that of our reader."""
+    write_colmap(tmp_path / "scene")
+    scene = write_transforms(tmp_path / "scene") | {"applied_transform": APPLIED.tolist()}
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps(scene))
+    found = undo_dataparser(drawn_path(tmp_path), write_dataparser(tmp_path), tmp_path / "scene", "colmap")
+    expected = read_camera_path(write(tmp_path, path_json()))
+    torch.testing.assert_close(found.cameras.camera_to_worlds, expected.cameras.camera_to_worlds)
+
+
+@pytest.mark.parametrize(
+    ("motion", "scale", "message"),
+    [
+        (MOTION[:2], 1.0, "transform: must be 3 rows of 4 numbers"),
+        (square(MOTION), 1.0, "transform: must be 3 rows of 4 numbers"),
+        (2 * MOTION, 1.0, "transform: is not a rigid motion"),
+        (MOTION[:, 0], 1.0, r"transform\[0\]: must be a list"),
+        (MOTION, 0.0, "scale: must be positive"),
+    ],
+)
+def test_a_bad_dataparser_file_is_named_in_one_line(motion: Any, scale: float, message: str, tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene")
+    with pytest.raises(InputError, match=message) as problem:
+        undo_dataparser(drawn_path(tmp_path), write_dataparser(tmp_path, motion, scale), tmp_path / "scene", "auto")
+    assert "dataparser_transforms.json" in str(problem.value)
+    assert "\n" not in str(problem.value)

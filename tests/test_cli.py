@@ -80,6 +80,12 @@ def test_render_a_camera_path_at_its_rate(run: Path, scene: Path, tmp_path: Path
     assert iio.immeta(tmp_path / "a.gif")["duration"] == 100
     assert edge_se("render", run, "--output-path", tmp_path / "a.gif", *flags, "--frames-per-second", 5).code == 0
     assert iio.immeta(tmp_path / "a.gif")["duration"] == 200
+    (tmp_path / "moved.json").write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.5}))
+    flags += ["--dataparser-transforms", tmp_path / "moved.json", "--output-path", tmp_path / "frames"]
+    assert edge_se("render", run, *flags).code == 0
+    shown = json.loads((tmp_path / "frames" / "frames.json").read_text())["frames"]
+    found, given = (np.array(pose)[:3, 3] for pose in (shown[1]["transform_matrix"], poses[1]))
+    np.testing.assert_allclose(found, 2 * given, rtol=1e-6)
 
 
 def test_show_and_methods(scene: Path, tmp_path: Path, edge_se):

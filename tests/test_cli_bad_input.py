@@ -243,6 +243,8 @@ class TestRuns:
         both = ("--kind", "test", "--camera-path", tmp_path / "path.json")
         assert "give one of them" in refused(edge_se, run, "render", run, *both)
         assert "path.json" in refused(edge_se, run, "render", run, *both[2:])
+        alone = ("--dataparser-transforms", tmp_path / "dataparser_transforms.json")
+        assert "without --camera-path" in refused(edge_se, run, "render", run, *alone)
         assert "--outputs" in refused(edge_se, run, "render", run, "--outputs", "rgb", "rgb")
         for path in (".", tmp_path):
             assert "must name a file" in refused(edge_se, run, "eval", run, "--output-path", path)

@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from exported import CELL, OPACITY, RADIUS, ball_model, ball_run, color_at, read_ply
+from exported import CELL, OPACITY, RADIUS, ball_model, ball_run, color_at, read_ply, surface_of
 
 from edge_se_sampler.export import surface
 from edge_se_sampler.export.mesh import render_colors, to_glb
-from edge_se_sampler.export.surface import find_surface, keep_largest
+from edge_se_sampler.export.surface import find_surface, keep_largest, simplify
+from edge_se_sampler.occupancy.bricks import BrickGrid
 
 trimesh = pytest.importorskip("trimesh")
-pytest.importorskip("skimage")
+for package in ("manifold3d", "skimage"):
+    pytest.importorskip(package)
 
 
 def mesh_of(vertices: np.ndarray, triangles: np.ndarray):
@@ -26,9 +28,9 @@ def mesh_of(vertices: np.ndarray, triangles: np.ndarray):
 def test_the_surface_of_a_ball_is_a_closed_sphere_however_it_is_cut_into_blocks(
     block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = find_surface(ball_model(), OPACITY)
+    whole = surface_of(ball_model())
     monkeypatch.setattr(surface, "BLOCK", block)
-    vertices, triangles = find_surface(ball_model(), OPACITY)
+    vertices, triangles = surface_of(ball_model())
     mesh = mesh_of(vertices, triangles)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)  # negative, were it inside out
@@ -40,7 +42,7 @@ def test_the_surface_of_a_ball_is_a_closed_sphere_however_it_is_cut_into_blocks(
 
 def test_a_lower_opacity_is_further_out() -> None:
     """The logarithm of density falls by 2 from cell to cell."""
-    radius = [np.linalg.norm(find_surface(ball_model(), opacity)[0], axis=1).mean() for opacity in (OPACITY, 0.04)]
+    radius = [np.linalg.norm(surface_of(ball_model(), opacity)[0], axis=1).mean() for opacity in (OPACITY, 0.04)]
     expected = np.log(np.log(1 - OPACITY) / np.log(1 - 0.04)) / 2
     assert (radius[1] - radius[0]) / CELL == pytest.approx(expected, abs=0.02)
 
@@ -49,13 +51,13 @@ def test_smaller_cells_than_the_finest_were_to_be_need_more_density_to_be_as_opa
     """Raw density is of the finest size, whatever the cells became."""
     model = ball_model()
     model.grid.finest_size *= 3
-    inside = np.linalg.norm(find_surface(model, OPACITY)[0], axis=1).mean()
+    inside = np.linalg.norm(surface_of(model)[0], axis=1).mean()
     assert (RADIUS - inside) / CELL == pytest.approx(np.log(3) / 2, abs=0.02)
 
 
 def test_where_no_cell_is_occupied_the_surface_closes() -> None:
     """Inside a hollow ball, and at the ends of a box that is dense all over: each at most half a cell beyond."""
-    vertices, triangles = find_surface(ball_model(hollow=True), OPACITY)
+    vertices, triangles = surface_of(ball_model(hollow=True))
     parts = mesh_of(vertices, triangles).split(only_watertight=True)
     inner, outer = sorted((np.linalg.norm(part.vertices, axis=1) for part in parts), key=np.mean)
     assert np.abs(outer - RADIUS).max() < 0.05 * CELL
@@ -64,7 +66,7 @@ def test_where_no_cell_is_occupied_the_surface_closes() -> None:
     model = ball_model()
     model.grid = type(model.grid).from_cells(torch.full((3,), -1.0), CELL, torch.ones((40, 39, 38), dtype=torch.bool))
     model.density = torch.nn.Parameter(torch.full((model.grid.num_rows, 1), 3.0))
-    box = mesh_of(*find_surface(model, OPACITY))
+    box = mesh_of(*surface_of(model))
     assert box.is_watertight
     sizes = np.array([40, 39, 38]) * CELL
     np.testing.assert_allclose(box.bounds, np.stack((np.full(3, -1.0), sizes - 1)), atol=0.5 * CELL)
@@ -72,7 +74,7 @@ def test_where_no_cell_is_occupied_the_surface_closes() -> None:
 
 
 def test_the_largest_components_are_kept() -> None:
-    everything = find_surface(ball_model(speck=True), OPACITY)
+    everything = surface_of(ball_model(speck=True))
     ball, *both = (keep_largest(*everything, count) for count in (1, 2, 0))
     assert mesh_of(*ball).is_watertight
     assert np.linalg.norm(ball[0], axis=1) == pytest.approx(RADIUS, abs=0.05 * CELL)
@@ -83,7 +85,7 @@ def test_the_largest_components_are_kept() -> None:
 
 def test_colors_are_those_of_the_surface() -> None:
     model = ball_model()
-    vertices, triangles = find_surface(model, OPACITY)
+    vertices, triangles = surface_of(model)
     normals = np.array(mesh_of(vertices, triangles).vertex_normals)
     np.testing.assert_allclose(render_colors(model, vertices, normals, 2 * CELL), color_at(vertices), atol=0.02)
 
@@ -139,10 +141,49 @@ def test_nothing_dense_is_an_error_and_no_file(tmp_path: Path, edge_se: Callable
     assert not path.exists()
 
 
-def test_a_dense_network_has_no_cells_to_make_a_mesh_of(run: Path, tmp_path: Path, edge_se: Callable) -> None:
-    answer = edge_se("export", run, "mesh", "--output-path", tmp_path / "mesh.ply")
+def test_a_simplified_surface_has_moved_by_no_more_than_the_tolerance() -> None:
+    vertices, triangles = surface_of(ball_model())
+    for tolerance in (0.05, 0.3):
+        mesh = mesh_of(*simplify(vertices, triangles, tolerance * CELL))
+        assert mesh.is_watertight
+        assert len(mesh.faces) < (1 - tolerance) * len(triangles)
+        radius = np.linalg.norm(mesh.triangles.mean(axis=1), axis=1)  # of the faces' middles, the farthest inside
+        assert np.abs(radius - RADIUS).max() < (tolerance + 0.05) * CELL
+        assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rough_surface_stays_closed(seed: int) -> None:
+    """Full of handles and holes, as of a short training."""
+    grid = BrickGrid.from_cells(torch.zeros(3), 1.0, torch.ones((20, 20, 20), dtype=torch.bool))
+    values = np.random.default_rng(seed).normal(size=grid.num_rows).astype(np.float32)
+    vertices, triangles = find_surface(grid, torch.from_numpy(values))
+    mesh = mesh_of(*simplify(vertices, triangles, 0.5))
+    assert mesh_of(vertices, triangles).is_watertight
+    assert mesh.is_watertight
+    assert 0 < len(mesh.faces) < 0.8 * len(triangles)
+
+
+def test_a_simplified_mesh_has_colors_and_normals_of_its_own(tmp_path: Path, edge_se: Callable) -> None:
+    run, path = ball_run(tmp_path), tmp_path / "mesh.ply"
+    assert edge_se("export", run, "mesh", "--output-path", path).code == 0
+    full = trimesh.load(path, process=False)
+    assert edge_se("export", run, "mesh", "--output-path", path, "--tolerance", 0.2).code == 0
+    mesh = trimesh.load(path, process=False)
+    assert mesh.is_watertight
+    assert len(mesh.faces) < 0.5 * len(full.faces)
+    directions = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    assert (mesh.vertex_normals * directions).sum(axis=1).min() > 0.9
+    np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3] / 255, color_at(mesh.vertices), atol=0.02)
+
+
+def test_a_tolerance_larger_than_the_surface_is_an_error_and_no_file(tmp_path: Path, edge_se: Callable) -> None:
+    path = tmp_path / "mesh.ply"
+    answer = edge_se("export", ball_run(tmp_path), "mesh", "--output-path", path, "--tolerance", 1000)
     assert answer.code == 2
-    assert "edge-se-nerf" in answer.err
+    assert "--tolerance is 1000" in answer.err
+    assert answer.err.count("\n") == 1
+    assert not path.exists()
 
 
 def test_vertices_on_one_edge_are_one_and_a_vertex_within_a_cell_stays() -> None:

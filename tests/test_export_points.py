@@ -15,7 +15,7 @@ from tiny import ball_views
 
 from edge_se_sampler.export.points import PointCloud, find_points
 
-for package in ("scipy", "skimage", "trimesh"):
+for package in ("manifold3d", "scipy", "skimage", "trimesh"):
     pytest.importorskip(package)
 VIEWS = ball_views(6, 48, RADIUS)
 SEEN_RADIUS = RADIUS - CELL * np.log(2 * np.log(2) / -np.log(1 - OPACITY)) / 2
@@ -183,11 +183,14 @@ def test_nothing_opaque_is_an_error_and_no_file(tmp_path: Path, edge_se: Callabl
 
 
 REFUSED = {
-    "mesh": [("--output-path", "mesh.obj"), ("--output-path", "nowhere/mesh.ply"), ("--keep-components", "-1")],
+    "mesh": [
+        ("--output-path", "mesh.obj"), ("--output-path", "nowhere/mesh.ply"), ("--keep-components", "-1"),
+        ("--tolerance", "-1"), ("--tolerance", "inf"), ("--picture", "mesh.jpg"), ("--picture", "nowhere/mesh.png"),
+    ],
     "points": [("--output-path", "points.glb"), ("--num-points", "3")],
     "splats": [("--output-path", "."), ("--num-points", "0")],
     "cameras": [("--output-path", "cameras.txt"), ("--output-path", "nowhere/transforms.json")],
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("kind", "flags"), [(kind, flags) for kind, each in REFUSED.items() for flags in each])

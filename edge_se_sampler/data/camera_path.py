@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.config import DataFormat
+from edge_se_sampler.data.dataset import find_format
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
+from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.data.transforms_frames import rigid_pose
 
 MAX_SIDE = 8192  # pixels
 FIELDS_OF_VIEW = 0.1, 179.0  # degrees
+OLD_COLMAP_TRANSFORM = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))
+"""The applied_transform that nerfstudio assumes of COLMAP's scenes whose json has none."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,34 @@ def read_camera_path(path: Path) -> CameraPath:
     centered = {"cx": width / 2, "cy": height / 2, "width": width, "height": height}
     cameras = Cameras.of(poses, fx=focal, fy=focal, **centered)
     return CameraPath(cameras, None if fps is None else fps.positive_number())
+
+
+def undo_dataparser(path: CameraPath, transforms: Path, data: Path, data_format: DataFormat) -> CameraPath:
+    """A path of a viewer of nerfstudio in the world of the data that its model was trained on: x of the data is
+    s (R x + t) in nerfstudio, by a run's dataparser_transforms.json. InputError for files that cannot be used."""
+    top, hint = read_json(transforms), "give the dataparser_transforms.json in the folder of nerfstudio's run"
+    motion, scale = _read_motion(top.required("transform", hint)), top.required("scale", hint).positive_number()
+    if find_format(data, data_format) == "transforms":  # whose own transform the file takes together with this one
+        scene = read_json(transforms_path(data))
+        applied, applied_scale = scene.optional("applied_transform"), scene.optional("applied_scale")
+        if applied is not None:
+            motion = motion @ np.linalg.inv(_read_motion(applied))
+        elif (data / "colmap" / "sparse" / "0").exists():
+            motion = motion @ np.linalg.inv((*OLD_COLMAP_TRANSFORM, (0, 0, 0, 1)))
+        scale /= 1.0 if applied_scale is None else applied_scale.positive_number()
+    poses = path.cameras.camera_to_worlds.numpy().copy()
+    poses[:, :, 3] = poses[:, :, 3] / scale - motion[:3, 3]
+    poses = path.cameras.camera_to_worlds.new_tensor(motion[:3, :3].T @ poses)
+    return replace(path, cameras=replace(path.cameras, camera_to_worlds=poses))
+
+
+def _read_motion(matrix: JsonValue) -> np.ndarray:
+    """A rigid motion (4, 4), of which a file has the upper 3 rows."""
+    rows = [row.list() for row in matrix.list()]
+    if [len(row) for row in rows] != [4, 4, 4]:
+        raise matrix.location.error(f"must be 3 rows of 4 numbers, not {quote(matrix.value)}", "take nerfstudio's file")
+    rows.append([JsonValue(value, matrix.location) for value in (0, 0, 0, 1)])
+    return np.vstack((rigid_pose(matrix, [entry for row in rows for entry in row]), (0, 0, 0, 1)))
 
 
 def _read_side(top: JsonValue, key: str) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from edge_se_sampler.data.camera_path import read_camera_path
+from edge_se_sampler.data.camera_path import read_camera_path, undo_dataparser
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, write_atomically
@@ -37,6 +37,7 @@ def render_run(
     *,
     kind: str | None = None,
     camera_path: Path | None = None,
+    dataparser_transforms: Path | None = None,
     num_frames: int = 60,
     frames_per_second: float | None = None,
     depth_unit: float | None = None,
@@ -45,9 +46,14 @@ def render_run(
     of the outputs (see `render_frame`) side by side, or as a folder of frames. InputError for what cannot be used."""
     if kind is not None and camera_path is not None:
         raise InputError("--kind and --camera-path: give one of them")
+    if dataparser_transforms is not None and camera_path is None:
+        raise InputError("--dataparser-transforms has no effect without --camera-path")
     check_value("num-frames", num_frames, num_frames >= 1, "at least 1")
     check_value("outputs", outputs, len(outputs) == len(set(outputs)) > 0, "at least one, each once")
     path = None if camera_path is None else read_camera_path(camera_path)
+    if path is not None and dataparser_transforms is not None:
+        assert config.data is not None  # the config is resolved
+        path = undo_dataparser(path, dataparser_transforms, config.data, config.data_format)
     rates = (frames_per_second, path and path.frames_per_second, FRAMES_PER_SECOND)
     rate = next(rate for rate in rates if rate is not None)
     if output_path.suffix:

@@ -22,11 +22,18 @@ class ExportMesh:
     more of it, shiny surfaces get holes."""
     keep_components: int = 1
     """How many of the surface's connected parts are kept, the largest first; 0: all."""
+    tolerance: float = 0.0
+    """How far the surface may move, in cells, to have fewer faces, and coarser colors; 0: it keeps all."""
+    picture: Path | None = None
+    """A PNG to write as well: a held-out image, the run's rendering of it, and there the mesh, in its colors and lit
+    from the camera. How far the mesh is from the depth that is rendered is told."""
+    picture_view: int = 0
+    """Which of the held-out images that is."""
 
     def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.mesh import export_mesh
 
-        return export_mesh(run, config, self.output_path, self.opacity_threshold, self.keep_components)
+        return export_mesh(run, config, **vars(self))
 
 
 @dataclass(frozen=True)

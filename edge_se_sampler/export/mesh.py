@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,47 +14,73 @@ import torch
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8, write_atomically
+from edge_se_sampler.engine.pipeline import analyze_views
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import load_model
+from edge_se_sampler.engine.session import load_model, read_train_views
 from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.export.density import find_density
+from edge_se_sampler.export.picture import read_compared, write_comparison
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
-from edge_se_sampler.export.surface import find_surface, keep_largest
-from edge_se_sampler.models.lean import LeanModel
+from edge_se_sampler.export.surface import find_surface, keep_largest, simplify
 from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.occupancy.bricks import BrickGrid
 
 RAYS_AT_ONCE = 2**16
 CELLS_BEFORE = 2
 """How far outside the surface the rays begin that its colors are rendered by, in cells."""
 
 
-def export_mesh(run: RunFolder, config: TrainerConfig, path: Path, opacity: float, keep_components: int) -> str:
-    """Write the surface at which a cell has that opacity across; returns a line about it. InputError if a value is out
-    of its range, the file cannot be written, or nothing is as opaque."""
-    check_value("opacity-threshold", opacity, 0 < opacity < 1, "above 0 and below 1")
+def export_mesh(
+    run: RunFolder,
+    config: TrainerConfig,
+    output_path: Path,
+    *,
+    opacity_threshold: float,
+    keep_components: int,
+    tolerance: float,
+    picture: Path | None,
+    picture_view: int,
+) -> str:
+    """Write the surface at which a cell has that opacity across; returns what there is to say about it. InputError if a
+    value is out of its range, a file cannot be written, or nothing is as opaque."""
+    check_value("opacity-threshold", opacity_threshold, 0 < opacity_threshold < 1, "above 0 and below 1")
     check_value("keep-components", keep_components, keep_components >= 0, "at least 0")
-    check_export(path, ".ply", ".glb")
+    check_value("tolerance", tolerance, 0 <= tolerance < math.inf, "at least 0")
+    check_export(output_path, ".ply", ".glb")
+    compared = None if picture is None else read_compared(config, picture, picture_view)
     import trimesh
 
     model, _ = load_model(run, config)
-    if not isinstance(model, LeanModel):
-        raise InputError(
-            f"{config.method_name} has no cells to make a mesh of; lean-nerf has, export points needs none"
-        )
-    vertices, triangles = find_surface(model, opacity)
+    grid, density = find_density(model, opacity_threshold, partial(analyze_box, config))
+    cell_size = float(grid.cell_size)
+    vertices, triangles = find_surface(grid, density)
     if not len(triangles):
-        raise InputError(f"--opacity-threshold is {opacity}: nothing is as opaque; give less, or train for longer")
+        problem = f"--opacity-threshold is {opacity_threshold}: nothing is as opaque"
+        raise InputError(f"{problem}; give less, or train for longer")
     vertices, triangles = keep_largest(vertices, triangles, keep_components)
+    if tolerance:
+        vertices, triangles = simplify(vertices, triangles, tolerance * cell_size)
+        check_value("tolerance", tolerance, len(triangles) > 0, "less: the whole surface is no larger")
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     normals = np.array(mesh.vertex_normals)
-    colors = render_colors(model, vertices, normals, CELLS_BEFORE * float(model.grid.cell_size))
-    if path.suffix.lower() == ".glb":
-        write_atomically(path, to_glb(vertices, normals, colors, triangles))
+    colors = render_colors(model, vertices, normals, CELLS_BEFORE * cell_size)
+    if output_path.suffix.lower() == ".glb":
+        write_atomically(output_path, to_glb(vertices, normals, colors, triangles))
     else:
-        write_ply(path, point_columns(vertices, normals) | color_columns(to_uint8(colors)), triangles)
+        write_ply(output_path, point_columns(vertices, normals) | color_columns(to_uint8(colors)), triangles)
     closed = "watertight" if mesh.is_watertight else "not watertight"
-    return describe_file(path, f"{len(vertices):,} vertices, {len(triangles):,} faces, {closed}")
+    report = describe_file(output_path, f"{len(vertices):,} vertices, {len(triangles):,} faces, {closed}")
+    if picture is None or compared is None:
+        return report
+    return f"{report}\n{write_comparison(picture, model, compared, mesh, colors)}"
+
+
+def analyze_box(config: TrainerConfig) -> BrickGrid:
+    """The cells that may hold something by a run's training views: a dense network without cells may have learned
+    anything that looks like the background outside of silhouettes."""
+    return analyze_views(read_train_views(config), replace(config.pipeline.model, empty_space_skipping=True)).grid()
 
 
 def render_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:

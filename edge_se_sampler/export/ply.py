@@ -19,7 +19,7 @@ def check_export(path: Path, *suffixes: str) -> None:
     if path.suffix.lower() not in suffixes:
         raise InputError(f"--output-path {path}: must end in {' or '.join(suffixes)}")
     check_output(path)
-    if any(find_spec(name) is None for name in ("scipy", "skimage", "trimesh")):
+    if any(find_spec(name) is None for name in ("manifold3d", "scipy", "skimage", "trimesh")):
         raise InputError("this needs the [export] extra: pip install 'edge-se-sampler[export]'")
 
 

@@ -13,6 +13,7 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import to_uint8
+from edge_se_sampler.engine.frames import SEEN
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import render_opaque
 from edge_se_sampler.engine.run_folder import RunFolder
@@ -21,7 +22,6 @@ from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.export.ply import check_export, color_columns, describe_file, point_columns, write_ply
 from edge_se_sampler.models.ray_model import RayModel
 
-MIN_OPACITY = 0.5
 NEIGHBORS = 12
 """Points around each that its normal is found from."""
 PIXELS_AT_ONCE = 2**15
@@ -100,7 +100,7 @@ def find_positions(
             colors, distance, opacity = render_opaque(model, rays)
             directions = rays.directions.cpu()
             positions = rays.origins.cpu() + distance * directions
-            seen = opacity[:, 0] > MIN_OPACITY
+            seen = opacity[:, 0] > SEEN
             if model.grid is not None:
                 seen &= model.grid.contains(positions.to(model.device)).cpu()
             found.append(torch.cat((positions, directions, colors, opacity), dim=1)[seen])

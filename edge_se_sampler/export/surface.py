@@ -4,7 +4,6 @@ blocks of the box that overlap by a corner, so that no grid of the whole box is 
 from __future__ import annotations
 
 import itertools
-import math
 
 import numpy as np
 import torch
@@ -12,7 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.models.lean import LeanModel
 from edge_se_sampler.occupancy.bricks import BRICK, BrickGrid
 
 BLOCK = 16
@@ -22,15 +20,13 @@ MAX_DIFFERENCE, LEAST_DIFFERENCE = 5.0, 0.02
 ends less than half a cell beyond. The least keeps vertices off corners: each is on one edge, triangles have area."""
 
 
-def find_surface(model: LeanModel, opacity: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (v, 3) float64, world units, and triangles (f, 3) of the closed surface at which a cell has that opacity
-    across; its normals point outwards. Both are empty where nothing is as opaque."""
+def find_surface(grid: BrickGrid, difference: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (v, 3) float64, world units, and triangles (f, 3) of the closed surface at which a difference passes 0,
+    by its values (64 K,) at the corners of cells; its normals point to where that is negative. Both are empty where
+    nothing is positive."""
     from skimage.measure import marching_cubes
 
-    grid = model.grid
-    # of the optical depth across a cell
-    threshold = math.log(-math.log1p(-opacity) * float(grid.finest_size / grid.cell_size))
-    difference = torch.where(find_corners(grid), model.density.detach()[:, 0] - threshold, -torch.inf).cpu()
+    difference = difference.float().cpu()
     away = difference.abs().clamp(LEAST_DIFFERENCE, MAX_DIFFERENCE)
     difference = torch.where(difference < 0, -away, away)
     numbers = F.pad(grid.numbers.cpu(), (1, 1) * 3, value=-1)  # bricks of nothing around the box
@@ -48,15 +44,6 @@ def find_surface(model: LeanModel, opacity: float) -> tuple[np.ndarray, np.ndarr
             progress.update(i + 1)
     corners, faces = _weld(np.concatenate(vertices), np.concatenate(triangles))
     return grid.aabb_min.cpu().numpy() + (corners - BRICK) * float(grid.cell_size), faces
-
-
-def find_corners(grid: BrickGrid) -> Tensor:
-    """(64 K,) bool: the rows of corners of occupied cells."""
-    found = torch.zeros(grid.num_rows, dtype=torch.bool, device=grid.occupied.device)
-    for some in torch.arange(len(grid.bricks), device=found.device).split(2**13):
-        brick, cell = torch.nonzero(grid.occupied[some], as_tuple=True)
-        found[grid.corner_rows(some[brick], cell)] = True
-    return found
 
 
 def _corners_of_block(numbers: Tensor, difference: Tensor) -> Tensor:
@@ -93,3 +80,12 @@ def keep_largest(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tup
     _, part = connected_components(coo_array((np.ones(len(edges[0])), edges), shape=(len(vertices),) * 2), False)
     kept = np.isin(part, np.argsort(-np.bincount(part[a]), kind="stable")[:count])
     return vertices[kept], (np.cumsum(kept) - 1)[triangles[kept[a]]]
+
+
+def simplify(vertices: np.ndarray, triangles: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices and triangles of a closed surface with fewer of both, nowhere farther than that from the first one,
+    and as closed; none if all of it is smaller."""
+    from manifold3d import Manifold, Mesh64
+
+    mesh = Manifold(Mesh64(vertices, triangles.astype(np.uint64))).simplify(tolerance).to_mesh64()
+    return mesh.vert_properties[:, :3], mesh.tri_verts.astype(np.int64)

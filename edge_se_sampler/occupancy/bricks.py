@@ -199,6 +199,11 @@ class BrickGrid(nn.Module):
         x, y, z = self.size.tolist()
         return dense[:x, :y, :z]
 
+    def coordinates(self, rows: Tensor) -> Tensor:
+        """(m, 3) int64: coordinates of cells, by their rows (m,), in the box."""
+        cell = rows % BRICK**3
+        return BRICK * self.bricks[rows // BRICK**3] + torch.stack((cell // 16, cell // 4 % 4, cell % 4), dim=1)
+
     def corner_rows(self, bricks: Tensor, cells: Tensor) -> Tensor:
         """(m, 8) int64: rows of the corners of cells, by their brick (m,) and number in it (m,), in the order of
         OFFSETS; -1 where a corner is not stored."""

@@ -160,9 +160,8 @@ class Viewed:
         if grid is None:
             return None
         with self.turns:
-            brick, cell = torch.nonzero(grid.occupied, as_tuple=True)
-            within = torch.stack((cell // 16, cell // 4 % 4, cell % 4), dim=1)
-            centers = grid.aabb_min + (4 * grid.bricks[brick] + within + 0.5).cpu() * grid.cell_size
+            cells = grid.coordinates(torch.nonzero(grid.occupied.reshape(-1))[:, 0]).cpu()
+            centers = grid.aabb_min + (cells + 0.5) * grid.cell_size
         return _some(centers.numpy()), float(grid.cell_size)
 
     def hull_cells(self) -> tuple[np.ndarray, float] | None:
