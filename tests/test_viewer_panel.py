@@ -46,6 +46,7 @@ def test_a_browser_sees_a_small_picture_at_once_and_then_a_sharp_one_until_it_mo
     wait_until(lambda: len(client.pictures) == count + 5)
     assert len(client.pictures[-1]) == 128
     panel.close()
+    assert panel._thread not in threading.enumerate()  # torch must not be at work when the interpreter ends
 
 
 def test_the_next_move_interrupts_what_becomes_sharp(viewed: Viewed) -> None:
@@ -98,7 +99,7 @@ def trained(folder: Path, view: Callable[[Trainer], None] = lambda _: None) -> T
 
 
 def test_a_viewed_training_has_bit_for_bit_the_weights_of_another(tmp_path: Path) -> None:
-    client = FakeClient()
+    client, flights = FakeClient(), []
 
     def view(trainer: Trainer) -> None:
         panel = client.panel(Viewed(trainer))
@@ -114,10 +115,12 @@ def test_a_viewed_training_has_bit_for_bit_the_weights_of_another(tmp_path: Path
                     break
             panel.close()
 
-        threading.Thread(target=fly, daemon=True).start()
+        flights.append(threading.Thread(target=fly, daemon=True))
+        flights[0].start()
         wait_until(lambda: client.pictures)
 
     alone, seen = trained(tmp_path / "alone"), trained(tmp_path / "viewed", view)
+    flights[0].join(60)
     assert len(client.pictures) > 1  # the first was waited for: at least one more while it trained
     assert int(seen.pipeline.model.grid.level) > 0  # cells have been subdivided under the viewer's eyes
     states = [trainer.pipeline.model.state_dict() for trainer in (alone, seen)]

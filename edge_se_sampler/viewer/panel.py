@@ -18,6 +18,8 @@ from edge_se_sampler.viewer.viewed import Viewed
 IDLE_SECONDS, IDLE_SHARE = 0.25, 4.0
 """Between two looks whether the weights have changed: at least so long, and so many times as long as the last picture
 took, for they change all the time in training, which should not wait for someone who may have left."""
+CLOSING_SECONDS = 10
+"""In which a picture that is being rendered is done, or given up."""
 
 
 class Panel:
@@ -34,12 +36,14 @@ class Panel:
         self.frusta = [self._add_camera(k) for k in range(len(viewed.cameras))]
         client.camera.on_update(self._refresh)
         self._refresh()
-        threading.Thread(target=self._run, daemon=True).start()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread, and wait for it: one that renders while the interpreter ends would abort the process."""
         self._closed = True
         self._changed.set()
+        self._thread.join(CLOSING_SECONDS)
 
     def _refresh(self, _: Any = None) -> None:
         self._changed.set()
