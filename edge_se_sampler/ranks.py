@@ -7,6 +7,7 @@ Every function is called by all ranks at the same point. In a single process non
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -53,6 +54,7 @@ def join(device: str) -> None:
         torch.cuda.set_device(local)
     with _lost_ranks_as_connection_errors():
         distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+    atexit.register(distributed.destroy_process_group)  # its threads may abort a process that ends before they do
     _rank, _world_size = distributed.get_rank(), world
 
 
