@@ -67,9 +67,12 @@ def test_the_picture_shows_truth_rendering_and_mesh(tmp_path: Path, edge_se: Cal
     assert lit[inside].max() > 0.95 > 0.8 > lit[inside].min()
     found = re.search(r"mesh is (\S+) pixels", answer.out)
     assert found is not None
-    # the depth that is rendered is about a cell within the surface
+    # the rendered depth is about a cell within the surface
     assert 0.5 < float(found[1]) / (CELL / (4 - RADIUS) * 1.4 * 48) < 1.5
     for view in (6, -1):
         answer = edge_se("export", run, "mesh", *flags, view)
         assert answer.code == 2
         assert "--picture-view" in answer.err
+    answer = edge_se("export", run, "mesh", *flags[:2], "--picture-view", 1)
+    assert answer.code == 2
+    assert "--picture" in answer.err

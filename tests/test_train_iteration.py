@@ -157,7 +157,7 @@ def test_a_loss_that_is_not_finite_raises_before_the_weights_change() -> None:
 def test_fused_adam_where_torch_supports_it(supported: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     adam = optimizers.RowAdam
     if supported and torch.__version__ < "2.4":
-        pytest.skip("this torch does not")
+        pytest.skip("before 2.4, torch has no fused Adam on a CPU")
 
     def old(*arguments: Any, **settings: Any) -> torch.optim.Adam:
         if settings.get("fused") and not supported:

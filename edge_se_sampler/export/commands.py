@@ -25,10 +25,10 @@ class ExportMesh:
     tolerance: float = 0.0
     """How far the surface may move, in cells, to have fewer faces, and coarser colors; 0: it keeps all."""
     picture: Path | None = None
-    """A PNG to write as well: a held-out image, the run's rendering of it, and there the mesh, in its colors and lit
-    from the camera. How far the mesh is from the depth that is rendered is told."""
+    """A PNG to write as well: a held-out image, the model's rendering of that view, and the mesh from the same camera, in
+    its colors and shaded in gray. The mesh's distance from the rendered depth is printed, in pixels."""
     picture_view: int = 0
-    """Which of the held-out images that is."""
+    """Number of that held-out image."""
 
     def export(self, run: RunFolder, config: TrainerConfig) -> str:
         from edge_se_sampler.export.mesh import export_mesh

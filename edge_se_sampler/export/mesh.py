@@ -49,6 +49,8 @@ def export_mesh(
     check_value("keep-components", keep_components, keep_components >= 0, "at least 0")
     check_value("tolerance", tolerance, 0 <= tolerance < math.inf, "at least 0")
     check_export(output_path, ".ply", ".glb")
+    if picture is None and picture_view:
+        raise InputError("--picture-view has no effect without --picture")
     compared = None if picture is None else read_compared(config, picture, picture_view)
     import trimesh
 

@@ -35,7 +35,7 @@ def read_compared(config: TrainerConfig, path: Path, view: int) -> Picture:
 
 def write_comparison(path: Path, model: RayModel, picture: Picture, mesh: Any, colors: np.ndarray) -> str:
     """Write a row of four images: a view, its rendering, and the mesh there, in its vertices' colors (v, 3) in [0, 1]
-    and lit from the camera. Returns a line on how far the mesh is from the depth that is rendered."""
+    and shaded in gray by a light at the camera. Returns a line with the mesh's distance from the rendered depth."""
     image, camera, background = picture.image, picture.camera, model.config.background_level
     size = image.shape[:2]
     rays = picture.rays(model.device)
@@ -55,7 +55,7 @@ def write_comparison(path: Path, model: RayModel, picture: Picture, mesh: Any, c
     both = hit & (opacity.reshape(size) > SEEN)
     pixels = np.abs(mesh_depth - depth)[both] * float(camera.fx) / depth[both]
     median, most = np.quantile(pixels, (0.5, 0.9)) if both.any() else (np.nan, np.nan)
-    return f"{path}: the mesh is {median:.2f} pixels from the depth that is rendered (median; 90 %: {most:.2f})"
+    return f"{path}: the mesh is {median:.2f} pixels from the rendered depth (median; 90 %: {most:.2f})"
 
 
 def rasterize(vertices: np.ndarray, triangles: np.ndarray, camera: Cameras) -> tuple[np.ndarray, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, TypeVar
@@ -57,7 +58,7 @@ LEAN_PRESETS = {
 
 
 @dataclass(frozen=True)
-class ModelConfig(InstantiateConfig):
+class ModelConfig(InstantiateConfig, ABC):
     """What every model has. What is left out (None) follows from the size, see `apply_preset`."""
 
     presets: ClassVar[Mapping[str, SizePreset]] = NERF_PRESETS
@@ -100,9 +101,9 @@ class ModelConfig(InstantiateConfig):
         return True
 
     @property
+    @abstractmethod
     def training_memory(self) -> int:
         """Bytes that training takes at most on a CPU, beside images; the size is decided."""
-        raise NotImplementedError
 
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
