@@ -25,8 +25,8 @@ class ExportMesh:
     tolerance: float = 0.0
     """How far the surface may move, in cells, to have fewer faces, and coarser colors; 0: it keeps all."""
     picture: Path | None = None
-    """A PNG to write as well: a held-out image, the model's rendering of that view, and the mesh from the same camera, in
-    its colors and shaded in gray. The mesh's distance from the rendered depth is printed, in pixels."""
+    """A PNG to write as well: a held-out image, the model's rendering of that view, and the mesh from the same camera,
+    in its colors and shaded in gray. The mesh's distance from the rendered depth is printed, in pixels."""
     picture_view: int = 0
     """Number of that held-out image."""
 
