@@ -52,6 +52,9 @@ def join(device: str) -> None:
         if local >= count:
             raise InputError(f"--nproc-per-node is above {count}, the GPUs of this machine: one process needs one")
         torch.cuda.set_device(local)
+    # imported later, as torch's optimizers do, its functions have the group as an argument's default, and it never ends
+    import torch.distributed.nn.functional
+
     with _lost_ranks_as_connection_errors():
         distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
     atexit.register(distributed.destroy_process_group)  # its threads may abort a process that ends before they do

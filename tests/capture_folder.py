@@ -19,7 +19,9 @@ FX, FY, CX, CY = 40.0, 42.0, 23.0, 19.5
 NAMES = [f"view {i:02d}.png" for i in range(COUNT)]
 COLUMN_STEP, ROW_STEP = 5, 7
 """Of red and green from pixel to pixel."""
-COLMAP_MODELS = {"PINHOLE": 1, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+COLMAP_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+SQUARE_PIXELS = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+"""Models with one focal length."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Distortion:
     @property
     def parameters(self) -> list[float]:
         """COLMAP's."""
-        focal = [FX] if self.model == "RADIAL" else [FX, FY]
+        focal = [FX] if self.model in SQUARE_PIXELS else [FX, FY]
         return [*focal, CX, CY, *self.terms.values()]
 
 

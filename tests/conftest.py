@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from tiny import SMALL
+from tiny import SMALL, copy_run
 
 from edge_se_sampler.cli import main
 from edge_se_sampler.data.synthetic.folder import make_scenes
@@ -56,9 +56,15 @@ def edge_se(capfd: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
     return call
 
 
+@pytest.fixture(scope="session")
+def _trained_run(_rendered_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("outputs")
+    flags = ["--data", str(_rendered_scene), "--output-dir", str(folder), "--experiment-name", "scene"]
+    main(["train", "edge-se-nerf", *flags, *SMALL])
+    return next((folder / "scene" / "edge-se-nerf").iterdir())
+
+
 @pytest.fixture
-def run(scene: Path, tmp_path: Path, edge_se: Callable[..., Answer]) -> Path:
-    """A finished run of edge-se-nerf on the scene."""
-    answer = edge_se("train", "edge-se-nerf", "--data", scene, "--output-dir", tmp_path / "outputs", *SMALL)
-    assert answer.code == 0, answer.err
-    return next((tmp_path / "outputs" / "scene" / "edge-se-nerf").iterdir())
+def run(_trained_run: Path, scene: Path, tmp_path: Path) -> Path:
+    """A finished run of edge-se-nerf on the scene, one training's in all tests."""
+    return copy_run(_trained_run, scene, tmp_path / "outputs")

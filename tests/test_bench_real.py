@@ -84,7 +84,36 @@ def test_the_page_has_medians_and_differences_on_the_same_seeds(tmp_path: Path) 
     page = describe(result_of(tmp_path, runs))
     assert "| lego, 400 px | 31.50 (30.00 to 32.00) | 33.00 |" in page
     assert "| chair, 400 px | 35.00 | – |" in page
-    assert "| lego, 400 px | 1m | no hull | 29.50 | -0.50 | 1 |" in page
+    assert "| lego, 400 px | 1m | no hull | 29.50 | -0.50 | 1 | 1.00 |" in page
+
+
+def test_budgets_of_steps_are_told_where_one_thing_is_changed_and_nowhere_else(tmp_path: Path) -> None:
+    runs = [run_of(30.0, 0), run_of(29.0, 0, budget="2000 steps"), run_of(25.0, 0, budget="500 steps")]
+    runs += [
+        run_of(28.0, 0, budget="2000 steps", variant="no hull", cpu_seconds=55.0),
+        run_of(25.1, 0, budget="500 steps", variant="no hull"),
+    ]
+    folder = result_of(tmp_path, runs)
+    page = describe(folder)
+    changed = page.split("## One thing changed")[1]
+    assert "| lego, 400 px | 500 steps | no hull | 25.10 | +0.10 | 1 | 1.00 |" in changed
+    assert "| lego, 400 px | 2000 steps | no hull | 28.00 | -1.00 | 1 | 0.50 |" in changed
+    assert changed.index("500 steps") < changed.index("2000 steps")
+    assert "steps |" not in page.split("## One thing changed")[0].replace("| steps |", "")
+    draw(folder, None)
+    assert (folder / "chart.png").exists()
+
+
+@pytest.mark.parametrize("budget", ["many steps", "1.5 steps", "0 steps", " steps", "soon"])
+def test_a_budget_is_a_time_or_a_number_of_steps(budget: str, scenes: Path, tmp_path: Path) -> None:
+    command = BenchReal(output_dir=tmp_path, scenes_dir=scenes, scenes=("bricks",), budgets=("1m", budget))
+    with pytest.raises(InputError, match=r"steps|time-budget"):
+        command.experiment()
+
+
+def test_a_training_has_as_many_steps_as_its_budget(scenes: Path, tmp_path: Path) -> None:
+    run = run_trial(Trial("bricks", 1, "3 steps", "lean-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
+    assert run["steps"] == 3
 
 
 def test_sizes_are_the_images(tmp_path: Path) -> None:
@@ -130,7 +159,7 @@ def test_programs_on_other_threads_are_refused(tmp_path: Path) -> None:
 def test_the_chart_has_a_panel_for_every_scene_and_size(tmp_path: Path) -> None:
     runs = [run_of(psnr, seed, budget=budget) for seed, budget, psnr in
             ((0, "3m", 32.0), (0, "1m", 30.0), (1, "1m", 31.0), (2, "1m", 33.0))]  # fmt: skip
-    runs += [run_of(28.0, 0, variant="no hull"), run_of(20.0, 0, variant="uniform pixels")]
+    runs += [run_of(28.0, 0, variant="no hull"), run_of(20.0, 0, variant="half the memory")]
     runs += [run_of(29.0, 0, downscale=1, size=[800, 800])]
     folder = result_of(tmp_path, runs, baseline_of(LEGO))
     figure = draw_chart(runs, read_baselines(folder))

@@ -33,7 +33,8 @@ def folder(tmp_path: Path) -> Path:
     """A copy of a committed result."""
     folder = tmp_path / "lean-ten-seeds"
     folder.mkdir()
-    shutil.copy(CONFIGS / folder.name / "result.json", folder)
+    for name in ("result.json", "notes.md"):
+        shutil.copy(CONFIGS / folder.name / name, folder)
     return folder
 
 

@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from edge_se_sampler.bench import runner
 from edge_se_sampler.bench.runner import (
     VERSION,
     Experiment,
@@ -257,15 +258,21 @@ class ExecutorWithoutCancel(ThreadPoolExecutor):
         super().shutdown(wait=wait)
 
 
-def test_an_interruption_keeps_what_is_finished_whatever_the_executor(tmp_path: Path) -> None:
+def test_an_interruption_keeps_what_is_finished_whatever_the_executor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupt_second(trial: ToyTrial) -> Run:
         if trial.seed == 1:
             raise KeyboardInterrupt
         return train(trial)
 
+    def ended_together(futures: Iterable[Future[Run]]) -> list[Future[Run]]:
+        return sorted(wait(futures).done, key=lambda future: future.exception() is None)
+
+    monkeypatch.setattr(runner, "as_completed", ended_together)
     with pytest.raises(KeyboardInterrupt):
         run_experiment(toy_experiment(interrupt_second), tmp_path, partial(ExecutorWithoutCancel, 1))
-    assert [run["seed"] for run in read(tmp_path)["runs"]] == [0]
+    assert [run["seed"] for run in read(tmp_path)["runs"]] == [0, 2]
 
 
 INTERRUPTED = """

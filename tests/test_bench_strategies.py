@@ -24,7 +24,6 @@ from edge_se_sampler.bench.strategies.summary import (
     count_failures,
 )
 from edge_se_sampler.bench.strategies.trials import (
-    DEFAULT,
     MODELS,
     PLANS,
     STRATEGIES,
@@ -41,7 +40,6 @@ from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MANAGER, MODEL
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.methods import method_configs
 from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
 
 SHORT = Settings(nerf=Length(0.6, 12, 2), lean=Length(1, 30, 2))
@@ -64,9 +62,6 @@ def test_every_strategy_can_be_trained_under_both_plans(model: str, strategy: st
         trial = replace(TRIAL, model=model, strategy=strategy, plan=plan)
         config = resolve_config(build_config(trial, SHORT, tmp_path), read_views(scene, 1, "train"))
         sampler: Any = config.pipeline.datamanager.pixel_sampler
-        if strategy == DEFAULT:
-            assert sampler == method_configs()["lean-nerf"].pipeline.datamanager.pixel_sampler
-            continue
         known = PIXEL_STRATEGIES.get(strategy)
         expected: dict[str, Any] = dict(STRATEGIES[strategy].settings)
         if known:
@@ -120,14 +115,14 @@ def test_what_is_compared_is_trained_side_by_side(tmp_path: Path) -> None:
         output_dir=tmp_path,
         scenes_dir=tmp_path,
         models=("nerf", "lean"),
-        strategies=("edge", DEFAULT),
+        strategies=("edge", "hard-samples"),
         plans=("steps",),
     )
     experiment = command.experiment()
     trials = experiment.trials([])
     first = Trial("nerf", "lego", 8, "centered", "steps", "edge", 0)
-    assert trials[:2] == [first, replace(first, scene="chair")]  # NeRF has no default of lean-nerf
-    assert len(trials) == 3 * 2 * 2 * 2 * (1 + 2)
+    assert trials[:2] == [first, replace(first, strategy="hard-samples")]
+    assert len(trials) == 3 * 2 * 2 * 2 * (2 + 1)  # hard samples are of NeRF alone
     assert experiment.arguments(first) == (Settings(), tmp_path / "lego")
 
 
@@ -279,7 +274,7 @@ def test_the_page_shows_the_numbers(tmp_path: Path) -> None:
         "| edge | 26.20 (0.40) | **+1.10** | +1.10 | +1.10 | 25.05 (0.10) | +0.05 | +0.05 | +0.05 | x2.00 | 0 of 4 |"
     )
     assert "| uniform | 25.10 (0.20) | – | – | – | 25.00 (0.00) | – | – | – | x1.00 | 2 of 4 |" in page
-    assert "| lean, 200 px | edge | +1.10 | better | – | – |" in page
+    assert "| lean, 200 px | edge | +1.10 | better |" in page
     assert "| lean +1.10, a step x2.00 | yes, better: lean, 200 px |" in tables(tmp_path)["strategies"]
     assert "broken" in page
     assert "10 s or 800 steps" in page
@@ -295,5 +290,5 @@ def test_the_picture_has_a_part_for_every_panel(tmp_path: Path) -> None:
 
 def test_claims_are_of_strategies_by_their_names() -> None:
     assert not {*PIXEL_STRATEGIES} - {*CLAIMS} - {"uniform"}
-    assert not {DEFAULT, "uniform"} & {*CLAIMS}
+    assert "uniform" not in CLAIMS
     assert {*MODELS} == {"nerf", "lean", "lean-no-masks"}

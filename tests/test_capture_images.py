@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +25,16 @@ from capture_folder import (
     Distortion,
     picture,
     read,
+    transforms,
     turned_jpeg,
     write_colmap,
     write_transforms,
 )
 
 from edge_se_sampler.data import memory
+from edge_se_sampler.data.image_file import ImageHeader, read_header
 from edge_se_sampler.data.lens import find_sources
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import NeRFModelConfig
@@ -103,6 +110,19 @@ def test_orientations_are_applied_where_the_size_says_so(orientation: int, store
         (tmp_path / "images" / name).write_bytes(turned_jpeg(stored(picture(i)), orientation))
     difference = read(tmp_path).images[0].astype(int) - picture(1)
     assert np.abs(difference).mean() < 4  # JPEG's
+
+
+def test_headers_of_pngs_are_read_without_their_pixels(tmp_path: Path) -> None:
+    """Be it that an orientation stands behind these."""
+    exif = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    chunk = len(exif).to_bytes(4, "big") + b"eXIf" + exif + zlib.crc32(b"eXIf" + exif).to_bytes(4, "big")
+    content = iio.imwrite("<bytes>", picture(0), extension=".png")
+    path = tmp_path / "a.png"
+    file = SourceFile(path, SourceLocation(path))
+    path.write_bytes(content[:-12] + chunk + content[-12:])
+    assert read_header(file) == ImageHeader(WIDTH, HEIGHT, 3, 6)
+    path.write_bytes(content[: content.index(b"IDAT") + 8])
+    assert read_header(file) == ImageHeader(WIDTH, HEIGHT, 3, 1)
 
 
 def test_orientations_that_the_camera_ignored(tmp_path: Path) -> None:
@@ -184,6 +204,37 @@ def test_train_and_inspect_say_what_training_takes(
     assert [match and match[1] for match in found] == [
         "images 0.1 MiB, tables 0.2 MiB, model up to 0.2 GiB; 3.0 GiB available"
     ] * 2
+
+
+READ = """
+import resource, sys
+from pathlib import Path
+from edge_se_sampler.data.dataset import DataSettings, read_split
+
+train = read_split(Path(sys.argv[1]), "train", DataSettings(downscale=8, eval_every=300))
+print(len(train.images), train.images[0].shape, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+def test_300_large_photographs_are_read_within_2_gib(tmp_path: Path) -> None:
+    """Of 12 million pixels each, whose lens is undone: decoded they would take 10 GiB."""
+    (tmp_path / "images").mkdir()
+    file = tmp_path / "images" / "0.jpg"
+    noise = np.random.default_rng(0).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    iio.imwrite(file, noise.repeat(10, axis=0).repeat(10, axis=1))
+    for i in range(1, 300):
+        os.link(file, file.with_name(f"{i}.jpg"))
+    large = {"w": 4000, "h": 3000, "fl_x": 3600, "fl_y": 3600, "cx": 2000, "cy": 1500}
+    document: dict[str, Any] = transforms(OPENCV) | large
+    frame = document["frames"][0]
+    document["frames"] = [frame | {"file_path": f"images/{i}.jpg"} for i in range(300)]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    command = [sys.executable, "-c", READ, str(tmp_path)]
+    answer = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+    *read_images, kilobytes = answer.rsplit(maxsplit=1)
+    assert read_images == ["299 (375, 500, 3)"]
+    assert int(kilobytes) < 2 * 2**20
 
 
 @pytest.mark.parametrize(("limit", "expected"), [("1000", 700), ("400", 100), ("max", None)])

@@ -25,6 +25,7 @@ from capture_folder import (
     NAMES,
     OPENCV,
     ROW_STEP,
+    SQUARE_PIXELS,
     WIDTH,
     Distortion,
     picture,
@@ -53,12 +54,12 @@ def project_by_opencv(distortion: Distortion, view: int, world: np.ndarray) -> n
     pose = poses()[view]
     rotation = (pose[:3, :3] * (1, -1, -1)).T
     turn, shift = cv2.Rodrigues(rotation)[0], -rotation @ pose[:3, 3]
-    matrix = np.array([[FX, 0, CX - 0.5], [0, FX if distortion.model == "RADIAL" else FY, CY - 0.5], [0, 0, 1]])
+    matrix = np.array([[FX, 0, CX - 0.5], [0, FX if distortion.model in SQUARE_PIXELS else FY, CY - 0.5], [0, 0, 1]])
     terms = np.array(list(distortion.terms.values()))
     if distortion.model == "OPENCV_FISHEYE":
         return cv2.fisheye.projectPoints(world[:, None], turn, shift, matrix, terms)[0][:, 0]
-    terms = np.concatenate((terms, np.zeros(2))) if distortion.model == "RADIAL" else terms
-    return cv2.projectPoints(world, turn, shift, matrix, terms if len(terms) else np.zeros(4))[0][:, 0]
+    terms = np.concatenate((terms, np.zeros(4)))[:4] if distortion.model in SQUARE_PIXELS else terms
+    return cv2.projectPoints(world, turn, shift, matrix, terms)[0][:, 0]
 
 
 def write_and_list(folder: Path, kind: str, distortion: Distortion) -> Capture:
@@ -69,12 +70,15 @@ def write_and_list(folder: Path, kind: str, distortion: Distortion) -> Capture:
     return read_colmap(folder)
 
 
-RADIAL = Distortion("RADIAL", {"k1": 0.1, "k2": -0.05})  # of COLMAP: a transforms.json states both focal lengths
+RADIAL = [  # of COLMAP: a transforms.json states both focal lengths
+    Distortion("SIMPLE_RADIAL", {"k1": 0.1}),
+    Distortion("RADIAL", {"k1": 0.1, "k2": -0.05}),
+]
 
 
 @pytest.mark.parametrize(
     ("kind", "distortion"),
-    [*product(("transforms", "binary", "text"), (OPENCV, FISHEYE)), ("binary", RADIAL), ("text", RADIAL)],
+    [*product(("transforms", "binary", "text"), (OPENCV, FISHEYE)), *product(("binary", "text"), RADIAL)],
 )
 def test_lenses_are_opencvs(kind: str, distortion: Distortion, tmp_path: Path) -> None:
     """Where an undistorted pixel's ray goes, OpenCV sees the source of that pixel, to 1e-4 of one."""

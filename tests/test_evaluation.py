@@ -13,6 +13,7 @@ import torch
 from tiny import tiny_config, tiny_views, with_constant_density
 from torch import Tensor
 
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on
@@ -120,6 +121,18 @@ def test_rendering_in_chunks_changes_neither_values_nor_the_models_mode(
         assert len(chunked) == 35
         assert not chunked.requires_grad
     assert model.training is training
+
+
+def test_no_more_rays_of_a_view_are_made_than_are_rendered_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, picture = model_of(), to_pictures(tiny_views(1, 5, 7))[0]
+    monkeypatch.setattr(model_module, "POINTS_PER_CHUNK", {"cpu": 100})
+    expected, counts = render_rays(model, picture.rays(torch.device("cpu"))), []
+    pixel_rays = Cameras.pixel_rays
+    monkeypatch.setattr(Cameras, "pixel_rays", lambda self, some: counts.append(len(some)) or pixel_rays(self, some))
+    rendered, _ = render_view(model, picture)
+    assert sum(counts) == 35
+    assert max(counts) == model.rays_per_chunk < 35
+    np.testing.assert_array_equal(rendered.reshape(-1, 3), expected.clamp(0, 1))
 
 
 def test_masked_pixels_do_not_count_and_views_without_others_are_left_out() -> None:

@@ -113,6 +113,7 @@ def test_cameras_that_differ_are_with_their_frames_and_masks_too(tmp_path: Path)
 
 
 def test_files_are_relative_to_the_json_and_points_beside_it_are_named(tmp_path: Path, edge_se: Callable) -> None:
+    pytest.importorskip("manifold3d", reason="points need the [export] extra")
     run, out = ball_run(tmp_path), tmp_path / "elsewhere" / "deep"
     out.mkdir(parents=True)
     cameras = ("export", run, "cameras", "--output-path", out / "transforms.json")

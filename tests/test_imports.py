@@ -139,3 +139,40 @@ def test_sampling_loads_no_files_networks_or_hosts() -> None:
     assert loaded >= set(modules)
     layers = {name.split(".")[1] for name in loaded if name.startswith(f"{PACKAGE}.")}
     assert layers == {"errors", "protocol", "sampling"}
+
+
+WITHOUT_UNIX = """
+import asyncio, multiprocessing, os, signal, sys
+sys.modules.update(dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios")))
+for name in ("fork", "getuid", "killpg", "sched_getaffinity", "sysconf"):
+    delattr(os, name)
+for name in ("SIGHUP", "SIGKILL", "pthread_kill", "pthread_sigmask"):
+    delattr(signal, name)
+from edge_se_sampler.cli import main
+for command in sys.argv[1:]:
+    try:
+        main(command.split())
+    except SystemExit as end:
+        assert not end.code, command
+"""
+
+
+def run_without_unix(*commands: str) -> None:
+    ended = subprocess.run([sys.executable, "-c", WITHOUT_UNIX, *commands], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_the_command_line_starts_without_what_windows_lacks() -> None:
+    run_without_unix("methods", "bench chart --help")
+
+
+@pytest.mark.slow
+def test_commands_run_without_what_windows_lacks(scene: Path, run: Path, tmp_path: Path) -> None:
+    run_without_unix(
+        f"inspect --data {scene} --output-path {tmp_path}/inspect.png",
+        f"train lean-nerf --data {scene} --output-dir {tmp_path}/o --max-num-iterations 6 --machine.device-type cpu",
+        f"eval {run} --output-path {tmp_path}/eval.json",
+        f"render {run} --num-frames 2 --output-path {tmp_path}/turn.gif",
+        f"resume {run} --max-num-iterations 9",
+        f"scenes --out {tmp_path}/scenes --names mic --size 16 --num-train 2 --num-val 1 --num-test 1",
+    )

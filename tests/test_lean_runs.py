@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -40,12 +41,14 @@ def trained(config: TrainerConfig) -> Trainer:
     return trainer
 
 
-def test_a_time_budget_is_kept_and_its_plan_repeats_it_bit_for_bit(scene: Path, tmp_path: Path) -> None:
+def test_a_time_budget_is_kept_and_its_plan_repeats_it_bit_for_bit(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = override(config_of(None), {"data": scene, "output_dir": tmp_path, "machine.device_type": "cpu"})
-    first = trained(override(config, {"time_budget": "3s"}))
-    assert first.elapsed + first.setup_seconds == pytest.approx(
-        3, rel=0.1
-    )  # a busy machine: the plan's own test is 3 %
+    with monkeypatch.context() as patch:  # a clock that goes on when it is looked at: the machine may be busy
+        patch.setattr("time.monotonic", itertools.count(0, 0.01).__next__)
+        first = trained(override(config, {"time_budget": "3s"}))
+    assert first.elapsed + first.setup_seconds == pytest.approx(3, rel=0.05)
     saved = RunFolder(first.run.path).config(method_configs())
     assert saved.segments is not None
     assert sum(saved.segments) == first.next_step
@@ -117,7 +120,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     model = trainer.pipeline.model
     views = trainer.pipeline.datamanager
     assert not bool(views.image_batch["mask"].all())  # only pixels whose rays hit the hull
-    assert views.train_pixel_sampler.config.late == "se"
+    assert views.train_pixel_sampler.config.late == "uniform"
     trainer.train()
     picture = to_pictures(read_blender(larger, "test"))[0]
     _, psnr = render_view(model, picture)
@@ -130,7 +133,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     assert torch.equal(render_rays(again, rays), render_rays(model, rays))
 
 
-def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: Path, tmp_path: Path) -> None:
+def test_without_alpha_it_trains_on_all_pixels(larger: Path, tmp_path: Path) -> None:
     trainer = prepare(lean_config(larger, tmp_path, cull_by_alpha=False))
     analysis = analyze_views(read_blender(larger, "train"), trainer.config.pipeline.model)
     assert analysis.num_silhouettes == 0
@@ -139,17 +142,22 @@ def test_without_alpha_it_trains_on_all_pixels_by_edges_while_they_pay(larger: P
     assert "mask" not in views.image_batch
     loss = [trainer.train_iteration(step) for step in range(3)]
     assert all(np.isfinite(loss))
-    sampler = views.train_pixel_sampler
-    assert (sampler.strategy, sampler.schedule.observations) == ("edge", 3)
-    assert "pixels   edge until the object is learned, then se" in describe_run(trainer)
 
 
 @pytest.mark.parametrize("by_alpha", [True, False])
 def test_pixels_that_were_chosen_stay_chosen(by_alpha: bool, larger: Path, tmp_path: Path) -> None:
     config = lean_config(larger, tmp_path, cull_by_alpha=by_alpha)
-    chosen = "edge" if by_alpha else "uniform"
-    sampler = prepare(override(config, {f"{SAMPLER}.early": chosen})).pipeline.datamanager.train_pixel_sampler
-    assert (sampler.strategy, sampler.config.schedule) == (chosen, "fraction")
+    sampler = prepare(override(config, {f"{SAMPLER}.early": "edge"})).pipeline.datamanager.train_pixel_sampler
+    assert (sampler.strategy, sampler.config.schedule) == ("edge", "fraction")
+
+
+@pytest.mark.parametrize(("by_alpha", "early"), [(True, "uniform"), (False, "edge until the object is learned")])
+def test_edges_come_first_where_no_alpha_tells_where_the_object_is(
+    by_alpha: bool, early: str, larger: Path, tmp_path: Path
+) -> None:
+    config = lean_config(larger, tmp_path, cull_by_alpha=by_alpha)
+    trainer = prepare(override(config, {f"{SAMPLER}.early": "auto", f"{SAMPLER}.late": "se"}))
+    assert f"pixels   {early}" in describe_run(trainer)
 
 
 def test_a_run_is_not_resumed_on_a_scene_that_has_changed(larger: Path, tmp_path: Path) -> None:
@@ -211,11 +219,11 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     assert findings["silhouettes"].startswith("6 of 6 views")
     assert findings["pixel"].startswith(f"{analysis.box.pixel_footprint:.4f}")
     assert findings["rays"].startswith(f"{100 * np.mean(analysis.hit_pixels):.1f} %")
+    assert "training draws among them" in findings["rays"]
     assert iio.imread(tmp_path / "inspect.png").shape[1] > 500
-    assert findings["sampling"].startswith("by squared errors")
     assert findings["training"] == "2048 rays a step, 4,000 steps: size tiny, by the images' longer side"
     unlocated = inspect(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False), tmp_path / "open.png")
-    assert "by edges as long as they pay" in unlocated
+    assert "training draws among them" not in unlocated
     whole = analyze_views(read_blender(larger, "train"), LeanModelConfig(cull_by_alpha=False)).hull.cells
     assert f"{whole.sum():,} of {whole.size:,} may hold something ({100 * whole.mean():.1f} %)" in unlocated
     for flag, value in (("--near", "7"), ("--voxel-size-px", "0"), ("--downscale", "0")):

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -106,8 +107,10 @@ def state(run: Path) -> dict[str, bytes | float | str]:
     ],
 )
 def test_resumed_equals_uninterrupted(tmp_path: Path, scene: Path, method: str, interrupt_at: int):
-    whole = session("train", tmp_path / "whole", scene, method=method)
-    first = session("train", tmp_path / "parts", scene, interrupt_at, method)
+    with ThreadPoolExecutor() as pool:
+        uninterrupted = pool.submit(session, "train", tmp_path / "whole", scene, method=method)
+        first = session("train", tmp_path / "parts", scene, interrupt_at, method)
+        whole = uninterrupted.result()
     run = Path(first["run"])
     assert [step for step, _ in first["pixels"]] == list(range(interrupt_at + 1))
     assert latest_checkpoint(run / "checkpoints").name == f"step-{interrupt_at:09d}.ckpt"

@@ -117,7 +117,7 @@ def test_the_same_seed_draws_the_same_picture_and_no_global_generator_is_touched
 
 def test_alpha_edges_without_alpha_are_refused_with_the_views_name(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    with pytest.raises(InputError, match=r"view 0: .*alpha"):
+    with pytest.raises(InputError, match=r"view 0': .*alpha"):
         draw(tmp_path / "x.png", tiny_views(1, HEIGHT, WIDTH, channels=3), edge_source="alpha")
     assert not list(tmp_path.iterdir())
 

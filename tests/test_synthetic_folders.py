@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -149,7 +148,7 @@ def test_a_folder_filled_meanwhile_is_never_touched(tmp_path: Path) -> None:
     def intrude(done: int, total: int) -> None:
         (tmp_path / "mic" / "notes.txt").write_text("keep")
 
-    with pytest.raises(OSError):
+    with pytest.raises(InputError, match="not empty"):
         make_scenes(tmp_path, ["mic"], size=8, num_train=1, num_val=0, num_test=0, progress=intrude)
     assert everything_below(tmp_path) == {"mic": b"", "mic/notes.txt": b"keep"}
 
@@ -195,14 +194,31 @@ def test_a_full_disk_is_reported_and_leaves_nothing_behind(tmp_path: Path) -> No
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no process groups to interrupt")
-@pytest.mark.parametrize("moment", ["workers starting", "workers at work"])
+@pytest.mark.parametrize("moment", ["half a semaphore", "half a worker", "workers starting", "workers at work"])
 def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
     """A terminal's Ctrl-C reaches every process of the group; only the first may answer."""
     script = tmp_path / "script.py"
+    cut = {
+        # it has its name, which nobody would remove yet
+        "half a semaphore": "register = resource_tracker.register\n"
+        "resource_tracker.register = lambda *given: (register(*given), signal.raise_signal(signal.SIGINT))\n",
+        # its process is there, and waits to be told what it is; another thread is as good as any for the signal
+        "half a worker": "spawn = util.spawnv_passfds\n"
+        "press = lambda: signal.pthread_kill(other.ident, signal.SIGINT)\n"
+        "util.spawnv_passfds = lambda *given: (spawn(*given), press())[0]\n",
+    }
     script.write_text(
+        "import signal, threading\n"
+        "from multiprocessing import resource_tracker, util\n"
+        "from multiprocessing.context import SpawnProcess\n"
         "from pathlib import Path\n"
         "from edge_se_sampler.data.synthetic.folder import make_scenes\n"
+        "start = SpawnProcess.start\n"
+        "other = threading.Thread(target=threading.Event().wait, daemon=True)\n"
+        "SpawnProcess.start = lambda process: (start(process), print('started', flush=True))\n"
+        f"{cut.get(moment, '')}"
         "if __name__ == '__main__':\n"
+        "    other.start()\n"
         "    try:\n"
         f"        make_scenes(Path({str(tmp_path / 'out')!r}), ['mic', 'ficus'], num_train=500,\n"
         "                    progress=lambda done, total: print(done, flush=True))\n"
@@ -221,14 +237,10 @@ def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         assert process.stdout is not None
-        if moment == "workers at work":
-            assert process.stdout.readline() == "1\n"
-        else:
-            while not list(tmp_path.glob("out/.partial-*/ficus/*test.json")):  # the last thing before they are started
-                assert process.poll() is None
-                time.sleep(0.01)
-            time.sleep(0.15)
-        os.killpg(process.pid, signal.SIGINT)
+        if moment not in cut:
+            awaited = {"workers starting": "started\n", "workers at work": "1\n"}[moment]
+            assert awaited in iter(process.stdout.readline, "")
+            os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=120)
     assert out.splitlines()[-1] == "stopped"
     assert err == ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,14 +16,18 @@ from lean_models import VIEWS, config_of
 from tiny import tiny_trainer
 
 from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.engine.config import SAMPLER, override
 from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.occupancy.hull import find_focus
 from edge_se_sampler.sampling.strategies import RankedError
 
 viser = pytest.importorskip("viser", reason="the viewer needs the [view] extra")
 
 from browsers import keyframe, view_tiny, wait_until  # noqa: E402
 
+from edge_se_sampler.viewer import html  # noqa: E402
 from edge_se_sampler.viewer.camera_path import FPS, View, camera_path  # noqa: E402
 from edge_se_sampler.viewer.rendering import Pace, Renderer, choose_heights  # noqa: E402
 from edge_se_sampler.viewer.viewed import Turns, Viewed  # noqa: E402
@@ -154,7 +159,8 @@ def test_the_drawn_cells_are_the_occupied_ones_and_the_hull(viewed: Viewed) -> N
 
 
 def test_probabilities_are_those_of_the_current_strategy() -> None:
-    viewed = Viewed(tiny_trainer(config_of(100), VIEWS))
+    by_errors = {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"}
+    viewed = Viewed(tiny_trainer(override(config_of(100), by_errors), VIEWS))
     sampler = viewed.trainer.pipeline.datamanager.train_pixel_sampler
     uniform = viewed.probability(0, lambda: None)
     assert viewed.strategy == "uniform"
@@ -194,3 +200,23 @@ def test_masks_leave_out_what_is_unknown(viewed: Viewed) -> None:
     assert found is not None
     np.testing.assert_array_equal(found, np.array(all_known) & masks)
     assert Viewed(tiny_trainer(method_configs()["vanilla-nerf"], VIEWS)).masks is None
+
+
+def test_an_html_file_begins_behind_the_cameras_that_turn(
+    viewed: Viewed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or they would pass close before the eyes."""
+    servers, set_initial_camera = [], html.set_initial_camera
+
+    def remember(server: Any, viewed: Viewed) -> Any:
+        servers.append(server)
+        return set_initial_camera(server, viewed)
+
+    monkeypatch.setattr(html, "set_initial_camera", remember)
+    monkeypatch.setattr(html.Viewed, "load", lambda *_: viewed)
+    monkeypatch.setattr(html, "NUM_POINTS", 100)
+    html.write_html(RunFolder(tmp_path), viewed.trainer.config, tmp_path / "run.html")
+    focus, _ = find_focus(viewed.cameras.to("cpu").to(dtype=torch.float64))
+    distance = np.linalg.norm(viewed.cameras.camera_to_worlds[:, :, 3].double().numpy() - focus, axis=1)
+    assert np.linalg.norm(np.asarray(servers[0].initial_camera.position) - focus) > 1.2 * distance.max()
+    assert (tmp_path / "run.html").stat().st_size > 10_000

@@ -49,6 +49,29 @@ def test_a_browser_sees_a_small_picture_at_once_and_then_a_sharp_one_until_it_mo
     assert panel._thread not in threading.enumerate()  # torch must not be at work when the interpreter ends
 
 
+def test_a_move_is_seen_even_if_it_comes_as_the_panel_stops_waiting_for_one(
+    viewed: Viewed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = FakeClient()
+    moves: list[float] = []
+
+    class LateEvent(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            was_set = super().wait(timeout)
+            if not was_set and moves:
+                client.move(moves.pop())
+            return was_set
+
+    with monkeypatch.context() as patch:
+        patch.setattr("edge_se_sampler.viewer.panel.threading.Event", LateEvent)
+        panel = client.panel(viewed)
+    wait_until(lambda: client.pictures and len(client.pictures[-1]) == 128)
+    count = len(client.pictures)
+    moves.append(1.0)
+    wait_until(lambda: len(client.pictures) > count)
+    panel.close()
+
+
 def test_the_next_move_interrupts_what_becomes_sharp(viewed: Viewed) -> None:
     client = FakeClient()
     panel, moves = client.panel(viewed), []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from edge_se_sampler.engine.pipeline import Pipeline, saved_grid
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.engine.trainer import Trainer
+from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import NeRFModelConfig
 from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
@@ -126,6 +128,14 @@ def resume_trainer(trainer: Trainer, views: Views) -> Trainer:
     resumed = config.setup(run=run, pipeline=pipeline, preview=None)
     resumed.resume(state)
     return resumed
+
+
+def copy_run(run: Path, data: Path, output_dir: Path) -> Path:
+    """A copy of a run below another output folder, as if it had been trained there, on a copy of its data."""
+    copied = RunFolder(Path(shutil.copytree(run, output_dir.joinpath(*run.parts[-3:]))))
+    config = copied.config(method_configs())
+    copied.write_config(replace(config, data=data, output_dir=output_dir))
+    return copied.path
 
 
 def ball_views(count: int = 6, size: int = 16, radius: float = 1.0) -> Views:

@@ -12,6 +12,7 @@ from edge_se_sampler.bench.chart.command import BenchChart
 from edge_se_sampler.bench.micro.command import BenchSamplers, BenchScoring
 from edge_se_sampler.bench.nerfstudio.command import BenchNerfstudio
 from edge_se_sampler.bench.paper.command import BenchPaper
+from edge_se_sampler.bench.processes.command import BenchProcesses
 from edge_se_sampler.bench.real.command import BenchReal
 from edge_se_sampler.bench.report import write_report
 from edge_se_sampler.bench.schedule.command import BenchSchedule
@@ -38,6 +39,7 @@ class BenchReport:
 BENCHES: dict[str, type] = {
     "samplers": BenchSamplers,
     "scoring": BenchScoring,
+    "processes": BenchProcesses,
     "nerfstudio": BenchNerfstudio,
     "paper": BenchPaper,
     "stability": BenchStability,

@@ -158,7 +158,8 @@ def _draw(path: Path, result: Mapping[str, Any], pictures: Mapping[str, np.ndarr
     for axis in axes.values():
         axis.set(xticks=[], yticks=[])
         axis.spines[:].set_color("#cccccc")
-    figure.suptitle(f"The same {SPLITS['num_train']} images; PSNR over {SPLITS['num_test']} test views", fontsize=13)
+    line = f"The same {SPLITS['num_train']} images; PSNR over {SPLITS['num_test']} test views"
+    figure.suptitle(f"{line}; Random and Edge + SE train the same network, lean-nerf is another model", fontsize=12)
     save_figure(figure, path)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
-import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -37,10 +36,15 @@ def machine() -> dict[str, Any]:
 def resident_memory(what: str = "VmRSS") -> int:
     """Bytes that this process holds resident now ("VmRSS"), or has held at most ("VmHWM").
 
-    From /proc: getrusage's maximum counts the parent's memory before exec. Elsewhere than Linux it has to do.
+    From /proc: getrusage's maximum counts the parent's memory before exec. Elsewhere than Linux it has to do, and on
+    Windows, which has neither, it is 0.
     """
     if kilobytes := _read_proc("self/status", what):
         return 1024 * int(kilobytes.split()[0])
+    try:
+        import resource
+    except ImportError:
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if platform.system() == "Darwin" else peak * 1024
 

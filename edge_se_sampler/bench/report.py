@@ -15,7 +15,7 @@ from edge_se_sampler.data.scene_file import quote, read_json
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
-REPORTS = ("chart", "paper", "stability", "schedule", "nerfstudio", "micro", "real", "strategies")
+REPORTS = ("chart", "paper", "stability", "schedule", "nerfstudio", "micro", "real", "strategies", "processes")
 """Experiments, each a package with a module `report`."""
 
 

@@ -18,6 +18,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -218,16 +219,19 @@ def _run_trials(
                 trial_of = {executor.submit(experiment.train, t, *experiment.arguments(t)): t for t in todo}
                 try:
                     for future in as_completed(trial_of):
-                        _store(result, trial_of[future], future)
+                        _store(result, trial_of.pop(future), future)
                         write_result(path, result)
                         progress.update(len(trials) - len(pending(trials, result)))
                     break
                 except BaseException as problem:
-                    for future in trial_of:
-                        future.cancel()
+                    for future, trial in trial_of.items():
+                        if not future.cancel() and future.done() and future.exception() is None:
+                            _store(result, trial, future)  # it had ended at the same time
                     if not isinstance(problem, BrokenExecutor):
                         for child in multiprocessing.active_children():  # their unfinished trials are lost in any case
                             child.terminate()
+                        with suppress(InputError):  # the disk may be what is the matter
+                            write_result(path, result)
                         raise
     for trial in pending(trials, result):
         result["errors"].append({**asdict(trial), "error": "its process, or one beside it, was killed repeatedly"})
@@ -251,7 +255,7 @@ def executor_factory(workers: int, scheduler: str | None) -> ExecutorFactory:
     InputError if the [cluster] extra is missing, or nobody answers at the address."""
     if scheduler is None:
         spawn = multiprocessing.get_context("spawn")  # a forked torch may hang
-        return lambda: ProcessPoolExecutor(workers, spawn, _initialize_worker)
+        return lambda: ProcessPoolExecutor(workers, spawn, initialize_worker)
     try:
         from distributed import Client  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -273,7 +277,7 @@ def run_in_subprocess(function: Callable[..., Any], *arguments: Any) -> Any:
             raise RuntimeError("its process was killed; is there too little memory?") from None
 
 
-def _initialize_worker() -> None:
+def initialize_worker() -> None:
     """Ctrl-C reaches every process of a terminal: only the one that hands out the trials answers it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _exit_with_parent()

@@ -11,7 +11,8 @@ import numpy as np
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.config import DataFormat
 from edge_se_sampler.data.dataset import find_format
-from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
+from edge_se_sampler.data.frames import MAX_POSITION
+from edge_se_sampler.data.scene_file import JsonValue, SourceLocation, quote, read_json
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.data.transforms_frames import rigid_pose
 
@@ -42,6 +43,7 @@ def read_camera_path(path: Path) -> CameraPath:
     poses = np.stack([_read_pose(camera) for camera in listed.list()])
     focal = [height / 2 / math.tan(_read_angle(camera) / 2) for camera in listed.list()]
     centered = {"cx": width / 2, "cy": height / 2, "width": width, "height": height}
+    _check_positions(poses, listed.location)
     cameras = Cameras.of(poses, fx=focal, fy=focal, **centered)
     return CameraPath(cameras, None if fps is None else fps.positive_number())
 
@@ -60,9 +62,17 @@ def undo_dataparser(path: CameraPath, transforms: Path, data: Path, data_format:
             motion = motion @ np.linalg.inv((*OLD_COLMAP_TRANSFORM, (0, 0, 0, 1)))
         scale /= 1.0 if applied_scale is None else applied_scale.positive_number()
     poses = path.cameras.camera_to_worlds.numpy().copy()
-    poses[:, :, 3] = poses[:, :, 3] / scale - motion[:3, 3]
+    with np.errstate(over="ignore"):  # infinite positions are refused below
+        poses[:, :, 3] = poses[:, :, 3] / scale - motion[:3, 3]
+    _check_positions(poses, top.location)
     poses = path.cameras.camera_to_worlds.new_tensor(motion[:3, :3].T @ poses)
     return replace(path, cameras=replace(path.cameras, camera_to_worlds=poses))
+
+
+def _check_positions(poses: np.ndarray, location: SourceLocation) -> None:
+    """InputError for cameras (n, 3, 4) too far away for numbers of 32 bits."""
+    if not np.abs(poses[:, :, 3]).max() <= MAX_POSITION:
+        raise location.error("has cameras that are too far away", f"write coordinates of at most {MAX_POSITION:g}")
 
 
 def _read_motion(matrix: JsonValue) -> np.ndarray:

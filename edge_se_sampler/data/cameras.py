@@ -33,9 +33,10 @@ class RayBundle:
 
     def split_pixels(self) -> RayBundle:
         """4 n rays: each ray replaced by those through the centers of its pixel's quarters."""
-        quarters = torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]]).to(self.directions) / 4
         center = self.directions * self.metadata["directions_norm"]
-        directions = (center[:, None] + quarters @ self.metadata["pixel_axes"]).reshape(-1, 3)
+        down, right = (self.metadata["pixel_axes"] / 4).unbind(dim=1)
+        quarters = center - down - right, center - down + right, center + down - right, center + down + right
+        directions = torch.stack(quarters, dim=1).reshape(-1, 3)
         norm = directions.norm(dim=1, keepdim=True)
         origins, camera_indices = (x.repeat_interleave(4, dim=0) for x in (self.origins, self.camera_indices))
         kept = {"nears", "fars"} & self.metadata.keys()
@@ -112,10 +113,11 @@ class Cameras:
         pixels = pixels.to(self.fx.device)
         return self.generate_rays(pixels[:, :1], pixels[:, 1:] + 0.5)
 
-    def image_rays(self, camera: int) -> RayBundle:
-        """All rays of one camera, row by row."""
+    def image_rays(self, camera: int, pixels: slice = slice(None)) -> RayBundle:
+        """Rays of one camera, row by row: of all its pixels, or of some, numbered in that order."""
         height, width = int(self.height[camera]), int(self.width[camera])
-        return self.pixel_rays(torch.cartesian_prod(torch.tensor([camera]), torch.arange(height), torch.arange(width)))
+        pixel = torch.arange(*pixels.indices(height * width))
+        return self.pixel_rays(torch.stack((torch.full_like(pixel, camera), pixel // width, pixel % width), dim=1))
 
     def project(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
         """Where one camera sees points (m, 3) in world units: the inverse of `generate_rays`. Returns coords (m, 2),

@@ -18,7 +18,7 @@ from edge_se_sampler.data.downscale import average_pixels, shrink_mask
 from edge_se_sampler.data.image_file import ImageHeader, read_header, read_image, turn_upright
 from edge_se_sampler.data.lens import Intrinsics, find_pinhole, find_sources, undistort
 from edge_se_sampler.data.memory import ModelMemory, check_memory, num_workers
-from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, quote
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
@@ -160,7 +160,7 @@ def _check_size(frame: Frame, downscale: int) -> None:
     header = frame.header
     if downscale > min(header.width, header.height):
         size = f"{header.width} x {header.height} pixels"
-        raise InputError(f"--downscale is {downscale}, but {frame.name} has only {size}; give a smaller number")
+        raise InputError(f"--downscale is {downscale}, but {quote(frame.name)} has only {size}; give a smaller number")
     if frame.camera.lens is not None and max(header.width, header.height) > MAX_REMAPPED:
         problem = f"has {header.width} x {header.height} pixels, too many to be undistorted"
         raise frame.image.error(problem, f"make it at most {MAX_REMAPPED} pixels wide and high")

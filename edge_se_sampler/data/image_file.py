@@ -8,12 +8,17 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from PIL import Image
 
 from edge_se_sampler.data.scene_file import SourceFile, quote
 from edge_se_sampler.errors import InputError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
+_PNG_EXIF = b"eXIf", b"Raw profile type", b"com.adobe.xmp"
+"""In a PNG that may have an orientation."""
+_ORIENTATION = 274
+"""EXIF's tag."""
 _COPY_AGAIN = "copy or download it again"
 
 # pillow's mode of the file -> the mode to read it in; others (CMYK, 32 bits, float) have no plain 8-bit meaning
@@ -43,14 +48,20 @@ def read_header(file: SourceFile) -> ImageHeader:
     """The header of an image file; InputError, as `read_image` raises, for one that has none."""
     try:
         file.check_regular()
-        with file.path.open("rb") as stream, iio.imopen(stream, "r", plugin="pillow") as opened:
-            metadata = opened.metadata(index=0, exclude_applied=False)
-        (width, height), orientation = metadata["shape"], metadata.get("Orientation", 1)
-        channels = 4 if "transparency" in metadata or _MODES.get(metadata["mode"]) == "RGBA" else 3
+        with file.path.open("rb") as stream, Image.open(stream) as image:
+            width, height = image.size
+            channels = 4 if "transparency" in image.info or _MODES.get(image.mode) == "RGBA" else 3
+            # pillow decodes a PNG whole to look for EXIF behind the pixels
+            may_be_turned = image.format != "PNG" or _may_have_exif(file.path.read_bytes())
+            orientation = image.getexif().get(_ORIENTATION, 1) if may_be_turned else 1
     except Exception:  # decoding says what is wrong
         height, width, channels = read_image(file).shape
         return ImageHeader(width, height, channels)
     return ImageHeader(width, height, channels, orientation if orientation in range(1, 9) else 1)
+
+
+def _may_have_exif(png: bytes) -> bool:
+    return any(name in png for name in _PNG_EXIF)
 
 
 def turn_upright(image: np.ndarray, orientation: int) -> np.ndarray:

@@ -15,8 +15,8 @@ from edge_se_sampler.errors import InputError
 @contextmanager
 def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
     """A temporary folder inside `out` in which to write workspace/<name> of every target; at the end they are moved.
-    On any exception nothing is left behind. InputError if a target is there and not empty, `out` cannot be written, or
-    the disk is full; OSError if a target was empty and no longer is."""
+    On any exception nothing is left behind. InputError if a target is there and not empty, or no longer empty at the
+    end, or `out` cannot be written, be it that the disk is full or a name too long."""
     _check_not_taken(out, targets)
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
@@ -35,8 +35,11 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
         with suppress(OSError):  # other programs' files have come in between: they stay
             for folder in missing:
                 folder.rmdir()
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise InputError(f"out is {out}, whose disk is full: nothing was left there; give another") from error
+        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+            is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            problem = "whose disk is full" if is_full else f"which cannot be written ({error})"
+            remedy = "shorten that name, or give another" if error.errno == errno.ENAMETOOLONG else "give another"
+            raise InputError(f"out is {out}, {problem}: nothing was left there; {remedy}") from error
         raise
 
 

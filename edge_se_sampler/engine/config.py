@@ -72,7 +72,7 @@ class TrainerConfig(InstantiateConfig):
     """The folder to train on: images, and a file of their cameras."""
     data_format: DataFormat = "auto"
     """Format of the folder: NeRF's Blender scenes (transforms_train.json and so on), one transforms.json (nerfstudio,
-    instant-ngp), or COLMAP's sparse model; auto: the first of these that it has."""
+    instant-ngp), COLMAP's sparse model, or LLFF's poses_bounds.npy; auto: the first of these that it has."""
     masks: Masks = "ignore"
     """What mask files mean. ignore: what is outside is unknown, and not trained on; object: it is background, as if
     the mask were the image's alpha."""

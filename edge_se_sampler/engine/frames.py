@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.scene_file import read_json
 from edge_se_sampler.engine.files import make_folder, to_uint8, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
@@ -39,25 +39,34 @@ def render_frame(
     raw-depth     (H, W) uint16: depth along the optical axis in depth_unit world units; 0 where nothing is
     """
     camera = cameras[[index]].to(model.device, torch.float32)
-    rays, (near, far) = camera.image_rays(0), model.config.depths
+    size = int(camera.height), int(camera.width)
+    parts = []
+    for some in model.chunks(math.prod(size)):  # all rays of a large frame would take many gigabytes
+        rendered = _render_pixels(model, camera.image_rays(0, some), depth_unit)
+        parts.append([rendered[name] for name in outputs])
+    images = map(np.concatenate, zip(*parts, strict=True))
+    return {name: image.reshape(*size, *image.shape[1:]) for name, image in zip(outputs, images, strict=True)}
+
+
+def _render_pixels(model: RayModel, rays: RayBundle, depth_unit: float) -> dict[str, np.ndarray]:
+    """The outputs of `render_frame` of n rays, (n, ...)."""
+    near, far = model.config.depths
     keys = ("rgb_fine", "accumulation_fine", "depth_fine", "background")
-    outputs_of_rays = render_outputs(model, rays, keys)
+    outputs = render_outputs(model, rays, keys)
     norm = rays.metadata["directions_norm"].cpu()
-    colors, distance = (x.numpy() for x in remove_background(outputs_of_rays, far * norm))
-    rgb, alpha, background = (outputs_of_rays[key].numpy() for key in (keys[0], keys[1], keys[3]))
+    colors, distance = (x.numpy() for x in remove_background(outputs, far * norm))
+    rgb, alpha, background = (outputs[key].numpy() for key in (keys[0], keys[1], keys[3]))
     alpha = alpha.clip(0, 1)
     depth = (distance / norm.numpy()).astype(np.float64).clip(near, far)
     turbo = cv2.applyColorMap(to_uint8((far - depth) / (far - near)), cv2.COLORMAP_TURBO)[:, 0, ::-1] / 255
     steps = np.where(alpha > SEEN, np.rint(depth / depth_unit).clip(1, MAX_16_BITS), 0)
-    images = {
+    return {
         "rgb": to_uint8(rgb),
         "rgba": to_uint8(np.concatenate((colors, alpha), axis=1)),
         "accumulation": to_uint8(alpha[:, 0]),
         "depth": to_uint8(alpha * turbo + (1 - alpha) * background),
         "raw-depth": steps[:, 0].astype(np.uint16),
     }
-    size = int(camera.height), int(camera.width)
-    return {name: images[name].reshape(*size, *images[name].shape[1:]) for name in outputs}
 
 
 def choose_depth_unit(far: float, unit: float | None) -> float:

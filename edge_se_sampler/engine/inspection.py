@@ -52,7 +52,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
         color = composite_on(unit_float(views.images[k]))
         axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
         axis.set(xticks=[], yticks=[])
-        axis.set_title(views.names[k], fontsize=9)
+        axis.set_title(views.names[k], fontsize=9, parse_math=False)
     figure.tight_layout(rect=(0, 0, 1, 0.96))
     save_figure(figure, path)
     return "\n".join(
@@ -86,8 +86,6 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         f"show enough to learn {ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million",
         "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
         "longer side",
-        "rays": f"{100 * share:.1f} % of the pixels may cross these cells",
-        "sampling": "by squared errors of earlier steps, among those pixels"
-        if analysis.num_silhouettes
-        else "by edges as long as they pay, for nothing tells where the object is, then by squared errors",
+        "rays": f"{100 * share:.1f} % of the pixels may cross these cells"
+        + ", and training draws among them alone" * (analysis.num_silhouettes > 0),
     }

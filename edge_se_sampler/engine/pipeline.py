@@ -74,7 +74,7 @@ def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
 def resolve_depths(views: Views, config: Model) -> tuple[Model, str]:
     """The config with near and far, where they are left out, from the training views, and their source."""
     if config.near is not None and config.far is not None:
-        return config, "as set"
+        return config, "the settings"
     found = find_depths(views)
     near = found.near if config.near is None else config.near
     far = found.far if config.far is None else config.far

@@ -26,9 +26,9 @@ class Picture:
     mask: np.ndarray | None = None
     """(H, W) bool: the pixels that are known; None: all."""
 
-    def rays(self, device: torch.device) -> RayBundle:
-        """The H * W rays of its pixels, row by row."""
-        return self.camera.to(device, torch.float32).image_rays(0)
+    def rays(self, device: torch.device, pixels: slice = slice(None)) -> RayBundle:
+        """The H * W rays of its pixels, row by row, or some of them."""
+        return self.camera.to(device, torch.float32).image_rays(0, pixels)
 
 
 def to_pictures(views: Views) -> list[Picture]:
@@ -57,11 +57,14 @@ def render_outputs(model: RayModel, rays: RayBundle, keys: Collection[str]) -> d
 def remove_background(outputs: Mapping[str, torch.Tensor], far: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Of n rays' outputs (on the CPU, with rgb_fine, accumulation_fine, depth_fine and background), what they would be
     without the background behind: colors (n, 3) in [0, 1] and distances (n, 1), world units, both means over what is
-    seen; of no meaning where that is nothing. far: (n, 1) distances at which the background counts."""
+    seen; of no meaning where that is nothing. far: (n, 1) distances at which the background counts.
+    FloatingPointError if one is not finite."""
     opacity = outputs["accumulation_fine"]
     passing, opaque = 1 - opacity, opacity.clamp(min=1e-3)
     colors = ((outputs["rgb_fine"] - passing * outputs["background"]) / opaque).clamp(0, 1)
-    return colors, (outputs["depth_fine"] - passing * far) / opaque
+    distance = (outputs["depth_fine"] - passing * far) / opaque
+    _check_finite(colors, distance)
+    return colors, distance
 
 
 def render_opaque(model: RayModel, rays: RayBundle) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -80,8 +83,15 @@ def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
     """A view's rendering (H, W, 3) in [0, 1] and its PSNR over the pixels that are known; FloatingPointError if a
     rendered value is not finite."""
     height, width = picture.image.shape[:2]
-    rendered = render_rays(model, picture.rays(model.device)).reshape(height, width, 3).clamp(0, 1).numpy()
-    if not np.isfinite(rendered).all():
-        raise FloatingPointError("the model's colors are not finite: training diverged; try a lower --optimizer.lr")
+    chunks = model.chunks(height * width)  # all rays of a photo would take gigabytes
+    parts = [render_rays(model, picture.rays(model.device, pixels)) for pixels in chunks]
+    colors = torch.cat(parts).clamp(0, 1)
+    _check_finite(colors)
+    rendered = colors.reshape(height, width, 3).numpy()
     error = (rendered.astype(np.float64) - composite_on(picture.image, model.config.background_level)) ** 2
     return rendered, psnr(float(error.mean() if picture.mask is None else error[picture.mask].mean()))
+
+
+def _check_finite(*rendered: torch.Tensor) -> None:
+    if not all(values.isfinite().all() for values in rendered):
+        raise FloatingPointError("the model's colors are not finite: training diverged; try a lower --optimizer.lr")

@@ -112,8 +112,9 @@ def prepare_resume(
     session_config.check()
     trainer = prepare(session_config, run, saved_grid(state["model"]))
     trainer.resume(state, changed_data)
-    run.write_config(config)
-    make_folder(run.path / "previews", "RUN")  # which git, for one, leaves out when it is empty
+    if ranks.is_main():
+        run.write_config(config)
+        make_folder(run.path / "previews", "RUN")  # which git, for one, leaves out when it is empty
     return trainer
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.datamanager import image_batch
+from edge_se_sampler.data.scene_file import quote
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
@@ -48,7 +49,7 @@ def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Pa
         try:
             p = probability_map(distribution, batch, k)
         except ValueError as problem:
-            raise InputError(f"{views.names[k]}: {problem}") from problem
+            raise InputError(f"{quote(views.names[k])}: {problem}") from problem
         _show_view(row, views, k, p, strategy, config.num_rays_per_batch, stream(seed, k, Stream.PIXELS))
     figure.tight_layout()
     save_figure(figure, path)
@@ -58,7 +59,7 @@ def _show_view(axes, views: Views, k: int, p: np.ndarray, strategy: str, count: 
     image = unit_float(views.images[k])
     height, width = p.shape
     axes[0].imshow(composite_on(image), interpolation="nearest")
-    axes[0].set_title(f"view {k}: {views.names[k]}", fontsize=9)
+    axes[0].set_title(f"view {k}: {views.names[k]}", fontsize=9, parse_math=False)
     relative = p * max(np.count_nonzero(p), 1)
     shown = axes[1].imshow(relative, cmap="magma", interpolation="nearest", vmin=0)
     axes[1].set_title(f"{strategy}: probability, 1 = uniform", fontsize=9)

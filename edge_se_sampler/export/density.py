@@ -25,7 +25,8 @@ def find_density(model: RayModel, opacity: float, find_box: Callable[[], BrickGr
     across; minus infinity at what is no corner of an occupied cell.
 
     lean-nerf has cells. Those of a dense network, its grid's or else those of `find_box`, are subdivided where they are
-    as opaque as that, until they are as small as the scene's finest, or would be too many.
+    as opaque as that, until they are as small as the scene's finest, or would be too many. FloatingPointError if a
+    density is not a number.
     """
     threshold = math.log(-math.log1p(-opacity))
     if isinstance(model, LeanModel):
@@ -58,6 +59,8 @@ def _evaluate(model: NeRFModel, grid: BrickGrid) -> Tensor:
             result[some] = model.fine(positions, any_direction, None)[0].log()
             done += len(some)
             progress.update(done)
+    if result.isnan().any():
+        raise FloatingPointError("the model's densities are not finite: training diverged; try a lower --optimizer.lr")
     return result
 
 

@@ -18,7 +18,7 @@ from edge_se_sampler.data.lens import Intrinsics
 from edge_se_sampler.data.mask_files import place_of_mask
 from edge_se_sampler.data.memory import num_workers
 from edge_se_sampler.data.new_folder import staged_folders
-from edge_se_sampler.data.scene_file import SourceLocation
+from edge_se_sampler.data.scene_file import SourceLocation, quote
 from edge_se_sampler.engine.files import check_output, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.masks.segmentation import segment
@@ -61,7 +61,7 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
     odd = [frame.name for frame, share in zip(frames, shares, strict=True) if share in (0, 1)]
     lines = [f"{len(masks)} masks in {', '.join(map(str, targets))}: the object covers {np.median(shares):.0%} of the "
              f"median image ({shares.min():.0%} to {shares.max():.0%})"]  # fmt: skip
-    lines += [f"of {len(odd)} images all or nothing is object, {odd[0]} for one"] if odd else []
+    lines += [f"of {len(odd)} images all or nothing is object, {quote(odd[0])} for one"] if odd else []
     then = f"edge-se train lean-nerf --data {folder} --masks object"
     if out != folder:
         then = f"copy what is in {out} into {folder}, or into a copy of it; then: {then}"

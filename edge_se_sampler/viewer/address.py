@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import socket
 import sys
 from dataclasses import dataclass
@@ -30,9 +31,9 @@ class ViewerConfig:
         except OSError as problem:
             if problem.errno == errno.EADDRINUSE:
                 raise self.taken() from None
-            raise InputError(
-                f"the viewer cannot listen on {self.host}, port {self.port} ({problem.strerror})"
-            ) from None
+            reason = problem.strerror if isinstance(problem, socket.gaierror) else os.strerror(problem.errno or 0)
+            address = f"{self.host}, port {self.port}"
+            raise InputError(f"the viewer cannot listen on {address} ({reason}); choose others") from None
         if self.host not in ("127.0.0.1", "localhost", "::1"):
             print(f"edge-se: whoever reaches {self.host} can look at this run: there is no password", file=sys.stderr)
 

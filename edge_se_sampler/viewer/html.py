@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import viser.transforms as tf
 
 from edge_se_sampler.engine.config import TrainerConfig
@@ -21,6 +22,8 @@ from edge_se_sampler.viewer.viewed import Viewed
 NUM_POINTS = 100_000
 TURN_SECONDS, TURN_STEPS = 12.0, 180
 """Of the turntable."""
+DISTANCE = 1.5
+"""From where it begins, as a multiple of the first training camera's: or others would pass close before the eyes."""
 
 
 def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
@@ -32,7 +35,8 @@ def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
     values = find_positions(viewed.model, viewed.cameras, viewed.masks, NUM_POINTS, rng)
     points, colors = values[:, :3], to_uint8(values[:, 6:9])
     with start_server(ViewerConfig(port=0)) as server:
-        focus, scale = set_initial_camera(server, viewed)
+        (focus, scale), start = set_initial_camera(server, viewed), server.initial_camera
+        start.position = focus + DISTANCE * (np.asarray(start.position) - focus)
         table = server.scene.add_frame("/turntable", show_axes=False, position=focus)
         look: dict[str, Any] = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
         size = scale / float(viewed.cameras.fy.max())  # of a pixel

@@ -125,7 +125,8 @@ class Panel:
         shown, pause = None, 0.0
         while not self._closed:
             moved = self._changed.wait(pause)
-            self._changed.clear()
+            if moved:  # or a move that came since the wait ended would be lost
+                self._changed.clear()
             version = self.viewed.trainer.next_step
             if not self._closed and (moved or version != shown):
                 shown, began = version, time.monotonic()

@@ -65,16 +65,15 @@ class Renderer:
         while first < count:
             if interrupted():
                 return None
-            pixel = torch.arange(first, min(first + self.turn.rays, count))
+            last = min(first + self.turn.rays, count)
             with self.viewed.turns:
                 turn_began, model = time.monotonic(), self.viewed.model
-                pixels = torch.stack((torch.zeros_like(pixel), pixel // width, pixel % width), dim=1)
-                rays = camera.to(model.device, torch.float32).pixel_rays(pixels)
+                rays = camera.to(model.device, torch.float32).image_rays(0, slice(first, last))
                 for name, depth in zip(("nears", "fars"), depths or (), strict=False):
                     rays.metadata[name] = torch.full_like(rays.directions[:, :1], depth)
                 turns.append(render_outputs(model, rays, keys))
-                self.turn.record(len(pixel), time.monotonic() - turn_began)
-            first += len(pixel)
+                self.turn.record(last - first, time.monotonic() - turn_began)
+            first = last
         self.frame.record(count, time.monotonic() - began)
         return {key: torch.cat([turn[key] for turn in turns]).reshape(height, width, -1) for key in keys}
 

@@ -31,7 +31,7 @@ def view_run(run: RunFolder, config: TrainerConfig, address: ViewerConfig) -> No
     or an address that is taken."""
     address.check()
     viewed = Viewed.load(run, config)
-    with open_viewer(viewed, address), suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), open_viewer(viewed, address):
         while True:
             time.sleep(RELOAD_SECONDS)
             with suppress(InputError):  # replaced by a newer one just now
@@ -42,8 +42,8 @@ def view_training(trainer: Trainer, address: ViewerConfig, train: Callable[[Trai
     """Train, by calling `train`, while whoever wants looks at the model; then show it until Ctrl-C."""
     with open_viewer(Viewed(trainer), address):
         train(trainer)
-        print("the viewer goes on until Ctrl-C", flush=True)
         with suppress(KeyboardInterrupt):
+            print("the viewer goes on until Ctrl-C", flush=True)
             threading.Event().wait()
 
 

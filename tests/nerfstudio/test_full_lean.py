@@ -33,7 +33,6 @@ from edge_se_sampler.engine.session import prepare, read_test_views  # noqa: E40
 from edge_se_sampler.errors import InputError  # noqa: E402
 from edge_se_sampler.methods import method_configs  # noqa: E402
 from edge_se_sampler.nerfstudio.lean_model import convert_rays  # noqa: E402
-from edge_se_sampler.sampling.schedule import AdaptiveSchedule  # noqa: E402
 
 STEPS, RAYS = 300, 256
 
@@ -185,7 +184,7 @@ def test_without_alpha_it_learns_where_the_object_is(scene: Path, tmp_path: Path
     model, sampler = trainer.pipeline.model, trainer.pipeline.datamanager.train_pixel_sampler
     near, far = model.field.config.depths
     assert 2 < near < 2.5 < 5.5 < far < 6.5  # the box reaches 1.5 from the origin, the cameras are 4 from it
-    assert isinstance(sampler.schedule, AdaptiveSchedule)
+    assert sampler.strategy == "uniform"
     assert "mask" not in trainer.pipeline.datamanager.train_image_dataloader.cached_collated_batch
     trainer.train()
     assert psnr_of(trainer.pipeline) > 26

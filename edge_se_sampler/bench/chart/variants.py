@@ -50,7 +50,7 @@ VARIANTS: dict[str, Variant] = {
     ),
     "edge-se-cached": Variant("errors", "Edge + SE (cached errors)", CACHED_ERRORS, "edge-se-nerf"),
     "edge-se-adaptive": Variant("errors", "Edge + SE (adaptive schedule)", ADAPTIVE, "edge-se-nerf"),
-    "lean-uniform": Variant("pixels", "uniform", {f"{SAMPLER}.late": "uniform", f"{SAMPLER}.error_source": "fine"}),
+    "lean-errors": Variant("pixels", "by cached squared errors", {f"{SAMPLER}.late": "se", **CACHED_ERRORS}),
     "lean-edge": Variant("pixels", "Edge first (adaptive schedule)", {f"{SAMPLER}.early": "edge", **ADAPTIVE}),
     "no-hull": Variant("parts", "no hull", {f"{MODEL}.cull_by_alpha": False}),
     "no-alpha-loss": Variant("parts", "no alpha loss", {f"{MODEL}.alpha_loss": 0.0}),

@@ -24,15 +24,19 @@ class BenchReal(ExperimentCommand):
     downscales: tuple[int, ...] = (2,)
     """Every so many pixels along both axes become one."""
     budgets: tuple[str, ...] = ("1m", "3m")
-    """Time budgets, as in edge-se train."""
+    """Time budgets, as in edge-se train, or numbers of steps ("2000 steps"), the same on any machine."""
     variants: tuple[str, ...] = ("lean-nerf",)
     """By their labels in the page; one thing is changed in each."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.real.trials import VARIANTS, Settings, Trial, run_trial
+        from edge_se_sampler.bench.real.trials import VARIANTS, Settings, Trial, run_trial, training_length
+        from edge_se_sampler.engine.config import override
+        from edge_se_sampler.methods import method_configs
 
         check_known("variants", self.variants, VARIANTS)
         check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
+        for budget in self.budgets:
+            override(method_configs()["lean-nerf"], training_length(budget)).check_plan()
         for scene in self.scenes:
             if not (self.scenes_dir / scene).is_dir():
                 raise InputError(

@@ -17,11 +17,13 @@ from edge_se_sampler.bench.real.summary import (
     best_psnr_at,
     by_program,
     label_of,
+    length_of,
     name_of,
     panel_of,
     panels_of,
     psnr_by_budget,
     seconds_of,
+    timed,
 )
 from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
 from edge_se_sampler.bench.runner import Run, read_result
@@ -36,19 +38,19 @@ Baselines = Mapping[str, Mapping[str, Any]]
 def draw(folder: Path, workplace: Path | None) -> None:
     del workplace
     result, baselines = _read(folder)
-    if result["runs"]:
-        save_figure(draw_chart(result["runs"], baselines), folder / "chart.png")
+    if runs := timed(result["runs"]):
+        save_figure(draw_chart(runs, baselines), folder / "chart.png")
 
 
 def describe(folder: Path) -> str:
     """The README.md of a folder with a result.json."""
     result, baselines = _read(folder)
-    runs = [run for run in result["runs"] if run["variant"] == BASELINE]
+    runs = _of_baseline(result["runs"])
     return fill_template(
         __file__,
         folder,
         psnr=_table_of_psnr(runs),
-        baselines=_table_of_baselines(result["runs"], baselines),
+        baselines=_table_of_baselines(timed(result["runs"]), baselines),
         published=_table_of_published(),
         gaps=_table_of(runs, {"test": "psnr", "SSIM": "ssim", "validation": "val_psnr", "training": "train_psnr"}),
         costs=_table_of_costs(runs),
@@ -61,13 +63,18 @@ def describe(folder: Path) -> str:
 def tables(folder: Path) -> dict[str, str]:
     """Tables that other texts show, by name."""
     runs = read_result(folder / "result.json")["runs"]
-    return {"real": _table_of_psnr([run for run in runs if run["variant"] == BASELINE])}
+    return {"real": _table_of_psnr(_of_baseline(runs))}
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], Baselines]:
     """The result, and those of other programs beside it, which had as many threads."""
     result = read_result(folder / "result.json")
     return result, read_baselines(folder, threads=result["machine"]["threads"])
+
+
+def _of_baseline(runs: list[Run]) -> list[Run]:
+    """lean-nerf's with a time budget; others are looked at where one thing is changed."""
+    return [run for run in timed(runs) if run["variant"] == BASELINE]
 
 
 def _by_key(runs: list[Run]) -> dict[Key, list[Run]]:
@@ -80,7 +87,7 @@ def _by_key(runs: list[Run]) -> dict[Key, list[Run]]:
 
 
 def _budgets(runs: list[Run]) -> list[str]:
-    return sorted({run["budget"] for run in runs}, key=seconds_of)
+    return sorted({run["budget"] for run in runs}, key=length_of)
 
 
 def _median(runs: list[Run], name: str) -> float:
@@ -165,7 +172,6 @@ def _table_of_variants(runs: list[Run]) -> str:
             baseline = [run for run in group if run["variant"] == BASELINE and run["seed"] in seeds]
             if len(baseline) == len(changed):
                 psnr, before = _median(changed, "psnr"), _median(baseline, "psnr")
-                rows.append(
-                    [label_of(panel), budget, variant, decimals(psnr), f"{psnr - before:+.2f}", str(len(seeds))]
-                )
-    return markdown_table(["", "budget", "changed", "PSNR", "difference", "seeds"], rows) if rows else ""
+                row = [label_of(panel), budget, variant, decimals(psnr), f"{psnr - before:+.2f}", str(len(seeds))]
+                rows.append([*row, f"{_median(changed, 'cpu_seconds') / _median(baseline, 'cpu_seconds'):.2f}"])
+    return markdown_table(["", "budget", "changed", "PSNR", "difference", "seeds", "CPU time"], rows) if rows else ""

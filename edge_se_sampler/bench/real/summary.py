@@ -11,6 +11,8 @@ from edge_se_sampler.bench.runner import Run
 
 BASELINE, WITHOUT_MASKS = "lean-nerf", "no hull"
 """Variants: the one that others are compared with, and the one that knows no masks in advance."""
+STEPS = " steps"
+"""Ends a budget that is a number of training steps."""
 Panel = tuple[str, tuple[int, int]]
 """A scene, and its images' width and height in pixels."""
 Trainings = list[Run]
@@ -37,13 +39,28 @@ def name_of(variant: str) -> str:
     return variant if variant == BASELINE else f"{BASELINE}, {variant}"
 
 
+def is_time(budget: str) -> bool:
+    """Whether a budget is a time; the others are numbers of steps, "2000 steps", the same on any machine."""
+    return not budget.endswith(STEPS)
+
+
+def timed(runs: list[Run]) -> list[Run]:
+    """The runs with a time budget."""
+    return [run for run in runs if is_time(run["budget"])]
+
+
+def length_of(budget: str) -> tuple[bool, float]:
+    """What sorts budgets: times, shortest first, before numbers of steps."""
+    return (False, seconds_of(budget)) if is_time(budget) else (True, float(budget.removesuffix(STEPS)))
+
+
 def seconds_of(budget: str) -> float:
     return float(budget.rstrip("smh")) * {"m": 60, "h": 3600}.get(budget[-1], 1)
 
 
 def psnr_by_budget(runs: list[Run]) -> dict[str, list[float]]:
-    """Of the seeds, for every budget, shortest first."""
-    budgets = sorted({run["budget"] for run in runs}, key=seconds_of)
+    """Of the seeds, for every time budget, shortest first."""
+    budgets = sorted({run["budget"] for run in timed(runs)}, key=seconds_of)
     return {budget: [run["psnr"] for run in runs if run["budget"] == budget] for budget in budgets}
 
 

@@ -12,18 +12,21 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.bench.machine import resident_memory
+from edge_se_sampler.bench.real.summary import STEPS, is_time
 from edge_se_sampler.bench.runner import Run, run_in_subprocess
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
+from edge_se_sampler.data.scene_file import quote
 from edge_se_sampler.engine.config import MODEL, SAMPLER, override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
+from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import method_configs
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "lean-nerf": {},
-    "uniform pixels": {f"{SAMPLER}.late": "uniform", f"{SAMPLER}.error_source": "fine"},
+    "pixels by cached errors": {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"},
     "one ray a pixel": {f"{MODEL}.supersample": False},
     "no hull": {f"{MODEL}.cull_by_alpha": False},
     "no total variation": {f"{MODEL}.total_variation": 0.0},
@@ -54,8 +57,19 @@ class Trial:
     scene: str
     downscale: int
     budget: str
+    """As in edge-se train, or "2000 steps"."""
     variant: str
     seed: int
+
+
+def training_length(budget: str) -> dict[str, Any]:
+    """A time budget, or a number of steps, as changes of a training's config; InputError if the number is none."""
+    if is_time(budget):
+        return {"time_budget": budget}
+    steps = budget.removesuffix(STEPS)
+    valid = steps.isdecimal() and int(steps) > 0
+    check_value("budgets", quote(budget), valid, 'a time, as 90s or 10m, or a number of steps, as "2000 steps"')
+    return {"max_num_iterations": int(steps)}
 
 
 def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
@@ -73,7 +87,7 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
     changes = {
         "data": scenes / trial.scene,
         "downscale": trial.downscale,
-        "time_budget": trial.budget,
+        **training_length(trial.budget),
         "output_dir": workplace / "runs",
         "machine.seed": trial.seed,
         **VARIANTS[trial.variant],

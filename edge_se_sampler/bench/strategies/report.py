@@ -22,7 +22,7 @@ from edge_se_sampler.bench.strategies.summary import (
     panels_of,
     strategies_of,
 )
-from edge_se_sampler.bench.strategies.trials import DEFAULT, PLANS, STRATEGIES, UNIFORM
+from edge_se_sampler.bench.strategies.trials import PLANS, STRATEGIES, UNIFORM
 from edge_se_sampler.engine.figures import save_figure
 
 VERDICTS: dict[Verdict | None, str] = {
@@ -136,15 +136,12 @@ def _describe_differences(runs: list[Run], strategy: str) -> str:
 
 
 def _table_of_best(runs: list[Run]) -> str:
-    """Of every panel the best at equal seconds, and lean-nerf's default beside it."""
+    """Of every panel the best at equal seconds, if any was compared."""
     rows = []
     for panel, label in labels_of(runs).items():
-        if (best := best_at_equal_seconds(runs, panel)) is None:
-            continue
-        default = compare(runs, panel, DEFAULT, "seconds")
-        rows.append([label, best, *_judge(compare(runs, panel, best, "seconds")), *_judge(default)])
-    head = ["", "best", "minus uniform", "verdict", "lean-nerf's default minus uniform", "verdict"]
-    return markdown_table(head, rows) if rows else ""
+        if (best := best_at_equal_seconds(runs, panel)) is not None:
+            rows.append([label, best, *_judge(compare(runs, panel, best, "seconds"))])
+    return markdown_table(["", "best", "minus uniform", "verdict"], rows) if rows else ""
 
 
 def _judge(comparison: Comparison | None) -> tuple[str, str]:

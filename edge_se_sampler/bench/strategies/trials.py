@@ -45,7 +45,7 @@ PLANS: tuple[PlanName, ...] = ("seconds", "steps")
 Placement = Literal["centered", "shifted"]
 PLACEMENTS: tuple[Placement, ...] = ("centered", "shifted")
 """The scene as it is; its pictures on a larger canvas, off center."""
-UNIFORM, DEFAULT = "uniform", "default"
+UNIFORM = "uniform"
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,9 @@ STRATEGIES = {
     "hard-samples": Strategy(
         "all pixels alike, the samples of their rays by their gradients", {}, ("nerf",), {"hard_samples": True}
     ),
-    DEFAULT: Strategy("what lean-nerf does by itself", models=("lean", "lean-no-masks")),
 }
 """Every one of the registry in all phases that it may stand for; ways to squared errors, and the paper's combination;
-uniform pixels of which hard samples are trained; and lean-nerf's default."""
+and uniform pixels of which hard samples are trained."""
 
 
 @dataclass(frozen=True)
@@ -167,10 +166,9 @@ def build_config(trial: Trial, settings: Settings, output_dir: Path) -> TrainerC
         **model.changes,
         **{f"{MODEL}.{name}": value for name, value in strategy.model_settings.items()},
     }
-    if trial.strategy != DEFAULT:
-        early_phase = {"schedule": "steps", "early_steps": max(1, length.steps // 10)}
-        sampler = {"early": UNIFORM, "late": UNIFORM, "error_source": "fine", **early_phase, **strategy.settings}
-        changes |= {f"{SAMPLER}.{name}": value for name, value in sampler.items()}
+    early_phase = {"schedule": "steps", "early_steps": max(1, length.steps // 10)}
+    sampler = {"early": UNIFORM, "late": UNIFORM, **early_phase, **strategy.settings}
+    changes |= {f"{SAMPLER}.{name}": value for name, value in sampler.items()}
     return override(method_configs()[model.method], changes)
 
 
