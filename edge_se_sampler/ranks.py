@@ -57,8 +57,19 @@ def join(device: str) -> None:
 
     with _lost_ranks_as_connection_errors():
         distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
-    atexit.register(distributed.destroy_process_group)  # its threads may abort a process that ends before they do
+    atexit.register(_leave)  # its threads may abort a process that ends before they do
     _rank, _world_size = distributed.get_rank(), world
+
+
+def _leave() -> None:
+    """End the group and its threads, which may need the interpreter to free their last tensors: before torch 2.8
+    (pytorch/pytorch#154976) gloo's own object alone, here the last to end, waits for them without holding it."""
+    import torch
+    from torch import distributed
+
+    gloo = distributed.distributed_c10d._get_default_group()._get_backend(torch.device("cpu"))
+    distributed.destroy_process_group()
+    del gloo
 
 
 def add_up(values: Tensor) -> Tensor:

@@ -51,6 +51,16 @@ TRAININGS = {
     ),
 }
 
+SUMS = """
+import torch
+from edge_se_sampler import ranks
+
+ranks.join("cpu")
+for step in range(100):
+    ranks.add_up(torch.ones(50_000))
+    ranks.agree(1.0)
+"""
+
 
 def curves_of(training: str, data: Path, output_dir: Path) -> tuple[list[float], list[float]]:
     """The loss of each step, and what a grid has seen by then, on whatever processes there are; a last checkpoint is
@@ -82,9 +92,13 @@ def start(world: int, *arguments: object) -> list[subprocess.Popen[str]]:
     ]
 
 
-def finish(processes: list[subprocess.Popen[str]]) -> str:
+def finish(processes: list[subprocess.Popen[str]], timeout: float = 240) -> str:
     """What rank 0 prints; the others print nothing."""
-    (out, err), *others = [process.communicate(timeout=240) for process in processes]
+    try:
+        (out, err), *others = [process.communicate(timeout=timeout) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
     assert [process.returncode for process in processes] == [0] * len(processes), (err, others)
     assert [text for text, _ in others] == [""] * len(others)
     return out
@@ -101,6 +115,12 @@ def check_same_losses(trainings: list[str], scene: Path, output_dir: Path) -> No
 
 def test_two_processes_have_the_loss_curve_of_one(scene: Path, tmp_path: Path) -> None:
     check_same_losses(["dense", "lean, without alpha"], scene, tmp_path)
+
+
+def test_processes_end_whose_threads_still_free_tensors(tmp_path: Path) -> None:
+    (script := tmp_path / "sums.py").write_text(SUMS)
+    for _ in range(3):  # one alone may end in time
+        finish(start(2, script), timeout=60)
 
 
 def test_one_process_alone_writes_to_a_run_that_is_resumed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
