@@ -39,7 +39,7 @@ class DataSettings:
     masks: Masks = "ignore"
     eval_every: int | None = None
     downscale: int = 1
-    model_memory: ModelMemory = lambda longest: 0
+    model_memory: ModelMemory = lambda *_: 0
     """What training takes of memory beside the images."""
 
 

@@ -66,7 +66,7 @@ class LoadSettings:
     """What a mask file means: pixels outside are unknown and ignored, or not of the object, which is alpha."""
     downscale: int = 1
     """Every so many pixels along both axes become one."""
-    model_memory: ModelMemory = lambda longest: 0
+    model_memory: ModelMemory = lambda *_: 0
     """What training takes of memory beside them."""
 
 
@@ -126,7 +126,9 @@ def load_views(
     check_cameras(frames)
     for frame in frames:
         _check_size(frame, settings.downscale)
-    memory = check_memory(_sizes(frames), settings.downscale, settings.model_memory, listing)
+    has_alpha = settings.masks == "object" or all(frame.header.channels == 4 for frame in frames)
+    of_model = partial(settings.model_memory, has_alpha)
+    memory = check_memory(_sizes(frames), settings.downscale, of_model, listing)
     largest = max(frame.header.width * frame.header.height for frame in frames)
     images, masks = [], []
     with ThreadPoolExecutor(num_workers(largest)) as pool:  # decoders and numpy release Python's lock

@@ -23,8 +23,9 @@ MEMORY_AT_WORK = 3 * 2**29
 """Bytes of all images that are decoded at the same time, at most; and half of what is available."""
 MIN_SIDE = 50
 """Pixels of the shorter side of the images that are still worth training on."""
-ModelMemory = Callable[[int], int]
-"""The longest side of the images, in pixels -> bytes that training a model takes beside them."""
+ModelMemory = Callable[[bool, int], int]
+"""Whether alpha tells where the object is, and the longest side of the images, in pixels -> bytes that training a model
+takes beside them."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +85,12 @@ def _physical_memory() -> int | None:
         return None
 
 
-def check_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, location: SourceLocation) -> str:
+def check_memory(
+    sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int], location: SourceLocation
+) -> str:
     """What training on images of these sizes takes, and what is available, in a line; InputError, which says what to
-    give, if that is less. `sizes` (n, 3) int64: width, height, bytes of a pixel; `location` is the file that lists
-    them."""
+    give, if that is less. `sizes` (n, 3) int64: width, height, bytes of a pixel; `model_memory` is the model's by the
+    longest side; `location` is the file that lists them."""
     needed, available = estimate_memory(sizes, downscale, model_memory), available_memory()
     if available is None:
         return str(needed)
@@ -98,7 +101,7 @@ def check_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, l
     raise location.error(f"{problem}, {_format(available)} are available", remedy)
 
 
-def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory) -> MemoryNeeds:
+def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int]) -> MemoryNeeds:
     """What training on images of these sizes takes, as `check_memory` has them."""
     width, height = sizes[:, 0] // downscale, sizes[:, 1] // downscale
     pixels = width * height
@@ -106,7 +109,7 @@ def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: ModelMemory
     return MemoryNeeds(images, tables, model_memory(int(max(width.max(), height.max()))))
 
 
-def _find_remedy(sizes: np.ndarray, downscale: int, model_memory: ModelMemory, available: int) -> str:
+def _find_remedy(sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int], available: int) -> str:
     for enough in range(downscale + 1, int(sizes[:, :2].min()) // MIN_SIDE + 1):
         if estimate_memory(sizes, enough, model_memory).total <= available:
             return f"give --downscale {enough}"

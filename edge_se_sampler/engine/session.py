@@ -166,14 +166,14 @@ def read_train_views(config: TrainerConfig) -> Views:
     return views if selected is None else views.subset(selected)
 
 
-def _training_memory(config: TrainerConfig, longest: int) -> int:
+def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> int:
     """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's own."""
     if choose_device(config.machine.device_type) == "cuda":
         return 0
-    return decide_size(config.pipeline.model, longest).training_memory
+    return decide_size(config.pipeline.model, longest).training_memory(has_alpha)
 
 
-def _read_split(config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda longest: 0) -> Views | None:
+def _read_split(config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda *_: 0) -> Views | None:
     assert config.data is not None
     settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory)
     with Progress(0, "reading images") as progress:

@@ -100,10 +100,9 @@ class ModelConfig(InstantiateConfig, ABC):
         """Whether the grid is the visual hull of the alpha masks, where there are any."""
         return True
 
-    @property
     @abstractmethod
-    def training_memory(self) -> int:
-        """Bytes that training takes at most on a CPU, beside images; the size is decided."""
+    def training_memory(self, has_alpha: bool) -> int:
+        """Bytes that training takes at most on a CPU, beside images, which have alpha or not; the size is decided."""
 
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
@@ -151,8 +150,7 @@ class NeRFModelConfig(ModelConfig):
     def culls_by_alpha(self) -> bool:
         return self.empty_space_skipping
 
-    @property
-    def training_memory(self) -> int:
+    def training_memory(self, has_alpha: bool) -> int:
         """Of two networks the weights, their gradients and Adam's two means; of a chunk's points what each layer
         returns, and its gradient."""
         preset = self.preset
@@ -217,12 +215,13 @@ class LeanModelConfig(ModelConfig):
     def culls_by_alpha(self) -> bool:
         return self.cull_by_alpha
 
-    @property
-    def training_memory(self) -> int:
-        """The rows of cells and their corners, and the samples of a step's rays."""
+    def training_memory(self, has_alpha: bool) -> int:
+        """The rows of cells and their corners, and the samples of a step's rays; the box that holds them, most of it
+        empty, takes as much again where no hull makes it small."""
         assert self.max_memory is not None
         valid = 0 < self.max_memory < INFINITY  # what is not, is refused later
-        return int(self.max_memory * 2**30 if valid else 0) + BYTES_PER_RAY * self.preset.rays
+        rows = int(self.max_memory * 2**30 if valid else 0)
+        return (rows if has_alpha and self.cull_by_alpha else 2 * rows) + BYTES_PER_RAY * self.preset.rays
 
     def check(self, prefix: str = "") -> None:
         super().check(prefix)
