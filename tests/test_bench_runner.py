@@ -309,6 +309,27 @@ def test_ctrl_c_waits_for_no_trial(tmp_path: Path) -> None:
     assert "KeyboardInterrupt" in errors
 
 
+STARTING = """
+import os, pathlib, time
+from test_bench_runner import executor_factory, run_experiment, toy_experiment, train
+
+if __name__ == "__mp_main__":  # a worker, which does not ignore Ctrl-C yet
+    print(os.getpid(), flush=True)
+    time.sleep(1)
+if __name__ == "__main__":
+    run_experiment(toy_experiment(train), pathlib.Path("."), executor_factory(1, None))
+"""
+
+
+def test_a_worker_that_starts_leaves_ctrl_c_to_its_parent(tmp_path: Path) -> None:
+    with run_script(STARTING, tmp_path) as process:
+        assert process.stdout is not None
+        os.kill(int(process.stdout.readline()), signal.SIGINT)
+        out, errors = process.communicate(timeout=120)
+    assert out == ""  # it is the only one
+    assert "Traceback" not in errors
+
+
 STARTS_A_WORKER = """
 import os, time
 from edge_se_sampler.bench.runner import executor_factory

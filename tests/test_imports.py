@@ -14,7 +14,7 @@ import pytest
 PACKAGE = "edge_se_sampler"
 ROOT = Path(__file__).parent.parent / PACKAGE
 LAYERS = [
-    ("errors", "protocol", "devices", "ranks"),
+    ("errors", "protocol", "devices", "ranks", "interrupts"),
     ("sampling",),
     ("",),  # the package itself: the public API
     ("data",),

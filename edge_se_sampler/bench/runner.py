@@ -28,6 +28,7 @@ from edge_se_sampler.data.scene_file import quote, read_json
 from edge_se_sampler.engine.files import checksum, make_folder, write_atomically
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.interrupts import interrupts_blocked, interrupts_delayed
 
 VERSION = 3
 """Of results. Version 2, which is read as well, has no checksum."""
@@ -215,9 +216,11 @@ def _run_trials(
     with Progress(len(trials), experiment.name, start=len(trials) - len(pending(trials, result))) as progress:
         for _ in range(MAX_BROKEN_POOLS):
             with new_executor() as executor:
-                todo = pending(trials, result)
-                trial_of = {executor.submit(experiment.train, t, *experiment.arguments(t)): t for t in todo}
+                trial_of: dict[Future[Run], Any] = {}
                 try:
+                    with interrupts_delayed(), interrupts_blocked():
+                        for trial in pending(trials, result):
+                            trial_of[executor.submit(experiment.train, trial, *experiment.arguments(trial))] = trial
                     for future in as_completed(trial_of):
                         _store(result, trial_of.pop(future), future)
                         write_result(path, result)

@@ -6,10 +6,9 @@ import json
 import math
 import os
 import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,6 +20,7 @@ from edge_se_sampler.data.synthetic.cameras import Camera, Framing, Placement, S
 from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, SCENE_NAMES, check_name, synthetic_scene
 from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.interrupts import interrupts_blocked, interrupts_delayed
 
 
 @dataclass(frozen=True)
@@ -111,46 +111,17 @@ def _render_all(views: Sequence[_View], workspace: Path, progress: Callable[[int
     with ExitStack() as stack:
         pictures = map(_render_png, views)
         if processes > 1:
-            with _interrupts_delayed():
+            with interrupts_delayed():
                 # a pool's first semaphore starts multiprocessing's tracker, which unblocks the signal: not blocked yet
                 pool = ProcessPoolExecutor(
                     processes, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
                 )
                 stack.callback(pool.shutdown, cancel_futures=True)
-                with _interrupts_blocked():
+                with interrupts_blocked():
                     pictures = pool.map(_render_png, views)
         for done, (view, png) in enumerate(zip(views, pictures, strict=True), start=1):
             (workspace / view.scene / f"{view.file}.png").write_bytes(png)
             progress(done, len(views))
-
-
-@contextmanager
-def _interrupts_delayed() -> Iterator[None]:
-    """Delays Ctrl-C until the end: what multiprocessing starts is not left half made."""
-    if threading.current_thread() is not threading.main_thread():  # no other is interrupted
-        yield
-        return
-    pressed: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-        if pressed:
-            signal.raise_signal(signal.SIGINT)
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Blocks Ctrl-C in processes started meanwhile, for good: their parent stops them."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows: that they ignore it once started must do
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _render_png(view: _View) -> bytes:
