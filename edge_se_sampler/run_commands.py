@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -165,7 +166,7 @@ def train(trainer: Any) -> None:
     trainer.train()
     if not is_main():
         sys.exit(130 if trainer.stop_requested else 0)
-    resume = f"edge-se resume {trainer.run.path}"
+    resume = f"edge-se resume {quote(str(trainer.run.path))}"
     if trainer.stop_requested:
         print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
         sys.exit(130)
@@ -173,6 +174,6 @@ def train(trainer: Any) -> None:
     stopping = trainer.early_stopping
     if stopping.is_due:
         print(f"stopped: no gain of {stopping.min_gain:g} dB in the last {stopping.patience} previews")
-    print(f"measure it: edge-se eval {trainer.run.path}")
+    print(f"measure it: edge-se eval {quote(str(trainer.run.path))}")
     if trainer.next_step != trainer.plan.num_steps:
         print(f"continue:   {resume}")

@@ -34,6 +34,7 @@ from capture_folder import (
 from edge_se_sampler.data import memory
 from edge_se_sampler.data.image_file import ImageHeader, read_header
 from edge_se_sampler.data.lens import find_sources
+from edge_se_sampler.data.mask_files import place_of_mask
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.errors import InputError
@@ -78,6 +79,18 @@ def test_masks_of_both_meanings(kind: str, distortion: Distortion, tmp_path: Pat
     assert small.masks is not None
     assert small.images[0].shape == (HEIGHT // 2, WIDTH // 2, 3)
     assert small.masks[0].shape == (HEIGHT // 2, WIDTH // 2)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "colmap"])
+def test_masks_of_images_that_are_links_are_where_they_were_written(kind: str, tmp_path: Path) -> None:
+    (write_colmap if kind == "colmap" else write_transforms)(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "photographs")
+    os.symlink("photographs", tmp_path / "images")
+    for image in (tmp_path.resolve() / "photographs").iterdir():
+        mask = place_of_mask(tmp_path, image)
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        iio.imwrite(mask, half_mask())
+    np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], half_mask())
 
 
 def test_masks_as_objects_where_there_are_none(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_formats_are_told_by_what_the_folder_has(tmp_path: Path) -> None:
     write_transforms(tmp_path)
     assert find_format(tmp_path) == "transforms"
     assert find_format(tmp_path, "colmap") == "colmap"
-    with pytest.raises(InputError, match="no scene in the format blender"):
+    with pytest.raises(InputError, match="no scene in the format blender; give a folder with"):
         find_format(tmp_path, "blender")
     write_blender(tmp_path)
     assert find_format(tmp_path) == "blender"
@@ -186,6 +186,14 @@ def test_scaled_images_scale_the_intrinsics(folder: str, tmp_path: Path) -> None
     assert (int(cameras.width[0]), int(cameras.height[0])) == (WIDTH // factor, HEIGHT // factor)
 
 
+def test_blanks_in_a_name_of_a_text_model_are_kept(tmp_path: Path) -> None:
+    name, old = "view  01.png", "view 01.png"
+    model = write_colmap(tmp_path, text=True)
+    (tmp_path / "images" / old).rename(tmp_path / "images" / name)
+    (tmp_path / "sparse/0/images.txt").write_bytes(model["images.txt"].replace(old.encode(), name.encode() + b" "))
+    assert read(tmp_path, "test").names[0] == name  # blanks come first
+
+
 @pytest.mark.parametrize("suffix", ["", ".png"])
 def test_names_without_suffix(suffix: str, tmp_path: Path) -> None:
     document = write_transforms(tmp_path)
@@ -198,16 +206,17 @@ def test_names_without_suffix(suffix: str, tmp_path: Path) -> None:
 
 
 def test_a_run_records_what_is_held_out_and_eval_uses_the_same(tmp_path: Path, edge_se: Any) -> None:
-    write_colmap(tmp_path / "mug", OPENCV)
-    flags = ("--data", tmp_path / "mug", "--eval-every", 3, "--output-dir", tmp_path / "outputs", *SMALL)
+    write_colmap(tmp_path / "a mug", OPENCV)
+    flags = ("--data", tmp_path / "a mug", "--eval-every", 3, "--output-dir", tmp_path / "outputs", *SMALL)
     answer = edge_se("train", "vanilla-nerf", *flags)
     assert answer.code == 0, answer.err
     assert "data     colmap: 6 views of 48 x 36, every 3rd image held out; no masks" in answer.out
-    (run,) = (tmp_path / "outputs/mug/vanilla-nerf").iterdir()
+    (run,) = (tmp_path / "outputs/a mug/vanilla-nerf").iterdir()
     config = json.loads((run / "config.json").read_text())
     near, far = config["pipeline"]["model"]["near"], config["pipeline"]["model"]["far"]
     assert (config["data_format"], config["eval_every"]) == ("colmap", 3)
     assert f"depths   {near:g} to {far:g}" in answer.out
+    assert f"measure it: edge-se eval '{run}'" in answer.out
     assert edge_se("eval", run, "--output-path", tmp_path / "eval.json").code == 0
     images = json.loads((tmp_path / "eval.json").read_text())["results"]["images"]
     assert [image["name"] for image in images] == [NAMES[0], NAMES[3], NAMES[6]]

@@ -246,6 +246,14 @@ def test_an_image_of_another_shape_or_damaged(tmp_path: Path) -> None:
     assert re.search(r"images\[1\]: 'view 01.png' is truncated", refusal(tmp_path))
 
 
+def test_an_image_of_another_kind_is_there(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    (tmp_path / "images" / "view 01.webp").write_bytes(iio.imwrite("<bytes>", picture(1), extension=".webp"))
+    document["frames"][1]["file_path"] = "images/view 01.webp"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert "'images/view 01.webp' is not a PNG or JPEG image" in refusal(tmp_path)
+
+
 def test_a_mask_of_another_size(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     (tmp_path / "masks").mkdir()

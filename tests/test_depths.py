@@ -16,6 +16,7 @@ from edge_se_sampler.data.dataset import read_split
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.session import resolve_config
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.occupancy.depths import find_depths
 from edge_se_sampler.occupancy.hull import find_focus
@@ -73,9 +74,13 @@ def test_cameras_alone() -> None:
     assert "cameras" in found.source
 
 
-def test_a_single_camera_or_parallel_ones_tell_nothing() -> None:
-    views = opaque(moved(ball_views(12, 32), 10.0, (0.0, 0.0, 0.0)))
-    assert "nothing else tells" in find_depths(views.subset([0])).source
+def test_a_single_camera_tells_nothing() -> None:
+    view = opaque(moved(ball_views(12, 32), 10.0, (0.0, 0.0, 0.0))).subset([0])
+    config = method_configs()["lean-nerf"]
+    with pytest.raises(InputError, match="give both near and far"):
+        resolve_config(config, view)
+    given = override(config, {"pipeline.model.near": 10.0, "pipeline.model.far": 60.0})
+    assert resolve_config(given, view).pipeline.model.depths == (10, 60)
 
 
 def test_focus() -> None:

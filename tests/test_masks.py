@@ -192,12 +192,15 @@ def test_masks_of_what_may_not_be_written_to_go_elsewhere(
 ) -> None:
     found = [image[..., 0] > 127 for image in images[:4]]
     monkeypatch.setattr("edge_se_sampler.masks.command.segment", lambda *_: found)
-    folder, out = tmp_path / "ring", tmp_path / "elsewhere"
-    write_capture(folder, images[:4])
+    folder, out = tmp_path / "a ring", tmp_path / "elsewhere"
+    write_capture(folder, images[:5])
+    (folder / "images" / "04.png").unlink()
     answer = edge_se("masks", "--data", folder, "--out", out, "--output-path", tmp_path / "masks.png")
     assert answer.code == 0
     assert f"4 masks in {out / 'masks'}" in answer.out
     assert f"copy what is in {out} into {folder}" in answer.out
+    assert f"--data '{folder}' --masks object" in answer.out
+    assert "1 of the 5 listed images do not exist" in answer.err
     assert sorted(path.name for path in folder.iterdir()) == ["images", "transforms.json"]
     assert sorted(path.name for path in (out / "masks").iterdir()) == [f"{i:02d}.png.png" for i in range(4)]
 

@@ -18,6 +18,7 @@ from edge_se_sampler.data.colmap_model import (
 )
 from edge_se_sampler.data.frames import Frame, choose_orientation, read_headers
 from edge_se_sampler.data.image_file import ImageHeader
+from edge_se_sampler.data.mask_files import find_mask
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, check_listed_once, locate_file
 
 FOLDERS = ("images", "images_2", "images_4", "images_8")
@@ -28,9 +29,9 @@ ROUNDING = 1.5
 
 def read_colmap(folder: Path) -> Capture:
     """The registered images of a scene that exist, in the order of their names, with the points that each sees. A mask
-    has its image's path in the folder `masks` (masks_2 for images_2, ...), with .png added or in place of the suffix;
-    an image without one is not masked. InputError for files that cannot be used, or if fewer than half of the images
-    exist."""
+    has its image's path in the folder `masks` (masks_2 for images_2, ...), with .png added or in place of the suffix,
+    or that of the file that it is a link to; an image without one is not masked. InputError for files that cannot be
+    used, or if fewer than half of the images exist."""
     model = find_model(folder)
     assert model is not None
     cameras, listed = read_cameras(model), read_images(model)
@@ -44,9 +45,10 @@ def read_colmap(folder: Path) -> Capture:
     pairs, missing = keep_existing(list(zip(listed, files, strict=True)), files, SourceLocation(files[0].location.file))
     headers = read_headers([file for _, file in pairs])
     masks_folder = folder / images_folder.name.replace("images", "masks")
+    masks = [_find_mask(image, masks_folder) or find_mask(folder, file) for image, file in pairs]
     frames = [
-        _frame(image, cameras[image.camera_id], file, header, masks_folder)
-        for (image, file), header in zip(pairs, headers, strict=True)
+        _frame(image, cameras[image.camera_id], file, header, mask)
+        for (image, file), header, mask in zip(pairs, headers, masks, strict=True)
     ]
     return Capture(frames, missing, points=_points_of(model, [image for image, _ in pairs]))
 
@@ -67,7 +69,7 @@ def _locate(images_folder: Path, image: ColmapImage) -> SourceFile:
 
 
 def _frame(
-    image: ColmapImage, camera: ColmapCamera, file: SourceFile, header: ImageHeader, masks_folder: Path
+    image: ColmapImage, camera: ColmapCamera, file: SourceFile, header: ImageHeader, mask: SourceFile | None
 ) -> Frame:
     def matches(header: ImageHeader) -> bool:
         return abs(header.height - header.width * camera.height / camera.width) <= ROUNDING
@@ -77,7 +79,7 @@ def _frame(
         problem = f"is {header.width} x {header.height} pixels, its camera's images {camera.width} x {camera.height}"
         raise file.error(problem, "use the images that the model was made of, or scaled ones")
     scaled = camera.intrinsics.scaled(header.width / camera.width, header.height / camera.height)
-    return Frame(image.name, file, _find_mask(image, masks_folder), image.pose, header, scaled)
+    return Frame(image.name, file, mask, image.pose, header, scaled)
 
 
 def _find_mask(image: ColmapImage, masks_folder: Path) -> SourceFile | None:

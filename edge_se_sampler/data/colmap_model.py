@@ -232,13 +232,13 @@ def _binary_points(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
         yield number, (x, y, z)
 
 
-def _lines(path: Path) -> Iterator[tuple[SourceLocation, list[str]]]:
-    """The lines of a text file that are no comments, split at blanks."""
+def _lines(path: Path, most: int = -1) -> Iterator[tuple[SourceLocation, list[str]]]:
+    """The lines of a text file that are no comments, split at blanks, at `most` so many; -1: at all."""
     location = SourceLocation(path)
     text = _decode(SourceFile(path, location).read_bytes(), location)
     for i, line in enumerate(text.splitlines()):
         if not line.startswith("#"):
-            yield SourceLocation(path, f"line {i + 1}"), line.split()
+            yield SourceLocation(path, f"line {i + 1}"), line.split(None, most)
 
 
 def _numbers(location: SourceLocation, words: list[str]) -> list[float]:
@@ -277,15 +277,15 @@ def _text_cameras(path: Path) -> Iterator[tuple[SourceLocation, int, str, list[f
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    lines = _lines(path)
+    lines = _lines(path, 9)  # a name may have blanks, and several in a row
     for location, words in lines:
         if not words:
             continue
         motion = _numbers(location, _words(location, words, 10)[1:8])
         (camera_id,) = _ids(location, words[8:9])
         _, points = next(lines, (location, []))  # an empty line for an image that sees none
-        point_ids = np.array(_ids(location, points[2::3]), dtype=np.int64)
-        yield _image(location, " ".join(words[9:]), camera_id, motion, point_ids)
+        point_ids = np.array(_ids(location, " ".join(points).split()[2::3]), dtype=np.int64)
+        yield _image(location, words[9].rstrip(), camera_id, motion, point_ids)
 
 
 def _text_points(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:

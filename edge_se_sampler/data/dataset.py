@@ -59,9 +59,11 @@ def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
     if data_format in found or (data_format == "auto" and found):
         return found[0] if data_format == "auto" else data_format
     wanted = CONTENTS if data_format == "auto" else {data_format: CONTENTS[data_format]}
-    problem = "has nothing that lists cameras" if data_format == "auto" else f"is no scene in the format {data_format}"
+    problem = "has nothing that lists cameras: no transforms_train.json or the like"
+    if data_format != "auto":
+        problem = f"is no scene in the format {data_format}"
     hint = "; ".join(f"{name}: {content}" for name, content in wanted.items())
-    raise SourceLocation(folder).error(f"{problem}: no transforms_train.json or the like", f"give a folder with {hint}")
+    raise SourceLocation(folder).error(problem, f"give a folder with {hint}")
 
 
 def read_split(
@@ -83,11 +85,8 @@ def read_split(
             return None
         return read_blender(folder, split, load, progress)
     capture, rows, eval_every = _read_capture(folder, split, settings, data_format)
-    if split == "train":
-        if capture.missing:
-            print(capture.missing, file=sys.stderr)
-        if not rows:
-            raise SourceLocation(folder).error("has no images to train on", "add some, or correct its lists")
+    if split == "train" and not rows:
+        raise SourceLocation(folder).error("has no images to train on", "add some, or correct its lists")
     if not rows:
         return None
     views = load_views([capture.frames[i] for i in rows], load, progress)
@@ -109,9 +108,11 @@ def _read_capture(
     folder: Path, split: Split, settings: DataSettings, data_format: DataFormat
 ) -> tuple[Capture, list[int], int | None]:
     """A capture, the indices of a split's frames, and every how many of them one is held out; None: the data says
-    which."""
+    which. With the training split it is said what was left out."""
     capture = READERS[data_format](folder)
     _check_unsplit(settings, has_own_split=capture.splits is not None)
+    if split == "train" and capture.missing:
+        print(capture.missing, file=sys.stderr)
     every = EVAL_EVERY if settings.eval_every is None else settings.eval_every
     return capture, capture.select(split, every), every if capture.splits is None else None
 

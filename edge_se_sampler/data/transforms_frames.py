@@ -168,11 +168,12 @@ def rigid_pose(matrix: JsonValue, entries: Sequence[JsonValue]) -> np.ndarray:
 
 
 def _locate(name: JsonValue, folder: Path) -> SourceFile:
-    """The file that `name` means; without .png, .jpg or .jpeg, the first of these that exists, else the first."""
+    """The file that `name` means; without .png, .jpg or .jpeg, the first of these that exists, else one of
+    exactly that name, which may be of another kind, else the first."""
     path = name.file_path()
     listed = listed_file(path)
     if path != listed:
-        others = (path + suffix for lower in _SUFFIXES for suffix in (lower, lower.upper()))
+        others = (*(path + suffix for lower in _SUFFIXES for suffix in (lower, lower.upper())), path)
         listed = next((other for other in others if os.path.isfile(folder / other)), listed)
     return locate_file(folder, listed, name.location)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -62,7 +63,7 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
     lines = [f"{len(masks)} masks in {', '.join(map(str, targets))}: the object covers {np.median(shares):.0%} of the "
              f"median image ({shares.min():.0%} to {shares.max():.0%})"]  # fmt: skip
     lines += [f"of {len(odd)} images all or nothing is object, {quote(odd[0])} for one"] if odd else []
-    then = f"edge-se train lean-nerf --data {folder} --masks object"
+    then = f"edge-se train lean-nerf --data {shlex.quote(str(folder))} --masks object"
     if out != folder:
         then = f"copy what is in {out} into {folder}, or into a copy of it; then: {then}"
     return "\n".join([*lines, f"look at {picture}; then: {then}"])

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from edge_se_sampler.data.cameras import Cameras
-from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, Views
+from edge_se_sampler.data.views import Views
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.occupancy.hull import Box, Hull, carve, find_focus, find_silhouettes
 
 POINT_PERCENTILES = 0.5, 99.5
@@ -42,11 +43,13 @@ class DepthRange:
 
 
 def find_depths(views: Views) -> DepthRange:
-    """The depths of a scene, from its training views."""
+    """The depths of a scene, from its training views; InputError if nothing tells."""
     if views.depths is not None:
         return DepthRange(*views.depths, "NeRF's Blender scenes")
     found = _depths_of_points(views) or _depths_of_silhouettes(views) or _depths_of_cameras(views)
-    return found or DepthRange(*NERF_SYNTHETIC_DEPTHS, "NeRF's Blender scenes, for nothing else tells: set both")
+    if found is None:
+        raise InputError("neither points, silhouettes nor cameras tell how deep the scene is: give both near and far")
+    return found
 
 
 def _depths_of_points(views: Views) -> DepthRange | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
 import time
 from typing import Any
@@ -117,7 +118,8 @@ class Panel:
         height = int(self.viewed.cameras.height.max())
         try:
             write_json(path, camera_path(self.keyframes, self.seconds.value, height))
-            self.client.add_notification("Saved", f"edge-se render {path.parent} --camera-path {path}")
+            command = shlex.join(["edge-se", "render", str(path.parent), "--camera-path", str(path)])
+            self.client.add_notification("Saved", command)
         except InputError as problem:
             self.client.add_notification("Not saved", str(problem), color="red")
 
