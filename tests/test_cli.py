@@ -179,3 +179,22 @@ def test_head_of_a_long_help_is_quiet():
     shown = subprocess.run(pipeline, shell=True, capture_output=True, text=True, check=True)
     assert shown.stdout.startswith("usage: ")
     assert shown.stderr == ""
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux's")
+@pytest.mark.parametrize("arguments", ["methods", "--help"])
+def test_a_full_disk_under_standard_output_is_one_line(arguments: str):
+    command = [sys.executable, "-m", "edge_se_sampler", *arguments.split()]
+    with open("/dev/full", "w") as full:
+        process = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (process.returncode, process.stderr.count("\n")) == (2, 1), process.stderr
+    assert "No space left" in process.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell's closed files")
+def test_a_training_needs_no_standard_output(scene: Path, tmp_path: Path):
+    flags = ["train", "edge-se-nerf", "--data", scene, "--output-dir", tmp_path, *SMALL]
+    command = 'exec "$@" >&- 2>&-'
+    python = [sys.executable, "-m", "edge_se_sampler"]
+    assert subprocess.run(["sh", "-c", command, "sh", *python, *map(str, flags)], check=False).returncode == 0
+    assert len(list(tmp_path.glob("*/*/*/checkpoints/*"))) == 1
