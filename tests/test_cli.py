@@ -181,6 +181,15 @@ def test_head_of_a_long_help_is_quiet():
     assert shown.stderr == ""
 
 
+@pytest.mark.parametrize("arguments", ["methods", "--help"])
+def test_an_output_of_few_characters_is_no_error(arguments: str):
+    """As a file on Windows is, or a path that is no UTF-8."""
+    command = [sys.executable, "-m", "edge_se_sampler", *arguments.split()]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux's")
 @pytest.mark.parametrize("arguments", ["methods", "--help"])
 def test_a_full_disk_under_standard_output_is_one_line(arguments: str):
