@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -22,6 +24,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exit code 2 for bad input, 1 for a training that diverged or lost
     one of its processes, 130 for Ctrl-C."""
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's, before it is imported: large pages for large tensors
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed, as by >&-
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # help has frames, and paths may be no UTF-8
     try:
         try:
             _run(list(sys.argv[1:] if arguments is None else arguments))
@@ -34,6 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _exit(str(problem), 2)
     except (FloatingPointError, ConnectionError) as problem:
         _exit(str(problem), 1)
+    except OSError as problem:  # of files that are no output: standard output's, the cache of compiled kernels
+        if problem.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left there is not tried again
+        _exit(f"{problem.filename or 'a file'}: cannot be written ({problem.strerror})", 2)
     except (MemoryError, RuntimeError) as problem:
         if not _is_out_of_memory(problem):
             raise

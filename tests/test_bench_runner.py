@@ -28,6 +28,7 @@ from edge_se_sampler.bench.runner import (
     read_result,
     run_experiment,
     run_in_subprocess,
+    write_result,
 )
 from edge_se_sampler.errors import InputError
 
@@ -153,6 +154,15 @@ def test_a_file_that_is_no_result_of_the_experiment_is_refused_and_kept(change: 
         with pytest.raises(InputError, match=r"result\.json"):
             run_experiment(toy_experiment(), tmp_path, one_thread)
         assert path.read_text() == text
+
+
+@pytest.mark.parametrize("name", ["result.json", "shards/1-of-2.json"])
+@pytest.mark.parametrize("run", [{}, {"scene": "mic"}, {"scene": "mic", "seed": [1]}, {"scene": "mic", "seed": "x"}])
+def test_runs_that_are_of_no_trial_are_refused(run: dict[str, Any], name: str, tmp_path: Path) -> None:
+    (tmp_path / "shards").mkdir()
+    write_result(tmp_path / name, {**EMPTY, "runs": [{"scene": "mic", "seed": 0}, run]})
+    with pytest.raises(InputError, match=rf"{name}.*none of bench toy"):
+        list_trials(toy_experiment(), tmp_path)
 
 
 def test_listing_trials_trains_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -179,3 +179,31 @@ def test_head_of_a_long_help_is_quiet():
     shown = subprocess.run(pipeline, shell=True, capture_output=True, text=True, check=True)
     assert shown.stdout.startswith("usage: ")
     assert shown.stderr == ""
+
+
+@pytest.mark.parametrize("arguments", ["methods", "--help"])
+def test_an_output_of_few_characters_is_no_error(arguments: str):
+    """As a file on Windows is, or a path that is no UTF-8."""
+    command = [sys.executable, "-m", "edge_se_sampler", *arguments.split()]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux's")
+@pytest.mark.parametrize("arguments", ["methods", "--help"])
+def test_a_full_disk_under_standard_output_is_one_line(arguments: str):
+    command = [sys.executable, "-m", "edge_se_sampler", *arguments.split()]
+    with open("/dev/full", "w") as full:
+        process = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (process.returncode, process.stderr.count("\n")) == (2, 1), process.stderr
+    assert "No space left" in process.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell's closed files")
+def test_a_training_needs_no_standard_output(scene: Path, tmp_path: Path):
+    flags = ["train", "edge-se-nerf", "--data", scene, "--output-dir", tmp_path, *SMALL]
+    command = 'exec "$@" >&- 2>&-'
+    python = [sys.executable, "-m", "edge_se_sampler"]
+    assert subprocess.run(["sh", "-c", command, "sh", *python, *map(str, flags)], check=False).returncode == 0
+    assert len(list(tmp_path.glob("*/*/*/checkpoints/*"))) == 1

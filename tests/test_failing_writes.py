@@ -8,8 +8,10 @@ import os
 import random
 import shutil
 import subprocess
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from test_killed import flat, metrics_of, state_of
 from tiny import SMALL
 
 from edge_se_sampler.bench.runner import read_result, run_experiment
+from edge_se_sampler.engine.run_folder import EventWriter
 from edge_se_sampler.errors import InputError
 
 SOME, ALL = 4, pytest.param(None, marks=pytest.mark.slow)
@@ -242,3 +245,23 @@ def test_a_file_system_that_becomes_read_only(scene: Path, edge_se, tmpfs) -> No
         answer = edge_se(*command)
         assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
         assert flat(state_of(run)) == state
+
+
+def test_a_disk_that_fills_under_tensorboard_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which writes in a thread of its own."""
+    record_writer = pytest.importorskip("tensorboard.summary.writer.record_writer")
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    printed: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", printed.append)
+    (events := EventWriter(tmp_path)).write({"step": 0, "loss": 1.0})
+    monkeypatch.setattr(record_writer.RecordWriter, "write", fail)
+    worker = events._writer.file_writer.event_writer._async_writer._worker
+    with suppress(InputError):  # whether it has failed by now or not
+        events.write({"step": 1, "loss": 1.0})
+    worker.join(30)
+    with pytest.raises(InputError, match="No space left"):
+        events.write({"step": 2, "loss": 1.0})
+    assert printed == []

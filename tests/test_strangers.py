@@ -211,6 +211,12 @@ def test_a_run_whose_checkpoint_is_no_file(kind: str, nerf: Path, refused: Calla
     assert "not a regular file" in refused("eval", nerf)
 
 
+def test_metrics_that_are_a_pipe_are_not_waited_for(nerf: Path, refused: Callable) -> None:
+    (nerf / "metrics.jsonl").unlink()
+    os.mkfifo(nerf / "metrics.jsonl")
+    assert "not a regular file" in refused("resume", nerf)
+
+
 def test_a_temporary_file_that_is_a_link_is_not_written_through(nerf: Path, tmp_path: Path, edge_se: Callable) -> None:
     (tmp_path / "outside").write_text("mine")
     for name in (".metrics.jsonl.tmp", "checkpoints/.step-000000005.ckpt.tmp"):

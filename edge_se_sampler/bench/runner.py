@@ -120,15 +120,28 @@ def run_experiment(
 def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[str, Any], bool]:
     """An experiment's result with the runs that only shards have, and whether there are any. InputError as
     `load_or_create`."""
-    result = load_or_create(output_dir / "result.json", experiment.name, experiment.settings)
+    path = output_dir / "result.json"
+    result = load_or_create(path, experiment.name, experiment.settings)
+    _check_runs(experiment, result, path)
     before = len(result["runs"])
     for path in sorted((output_dir / "shards").glob("*.json")):
         shard = load_or_create(path, experiment.name, experiment.settings)
+        _check_runs(experiment, shard, path)
         names = [field.name for field in fields(experiment.trials(result["runs"])[0])]
         runs = {tuple(run[name] for name in names): run for run in [*shard["runs"], *result["runs"]]}
         result["runs"] = [runs[key] for key in sorted(runs)]
         result["command"] = "\n".join(dict.fromkeys([*shard["command"].splitlines(), *result["command"].splitlines()]))
     return result, len(result["runs"]) > before
+
+
+def _check_runs(experiment: Experiment, result: dict[str, Any], path: Path) -> None:
+    """InputError if a result has runs of no trial that the experiment could have, or errors that are none."""
+    try:
+        trials = [asdict(trial) for trial in experiment.trials(result["runs"])]
+        names = list(trials[0]) if trials else []
+        sorted({tuple(run[name] for name in names) for run in [*trials, *result["runs"], *result["errors"]]})
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as problem:
+        raise InputError(f"{path}: its runs are none of bench {experiment.name} ({quote(problem)})") from problem
 
 
 def load_or_create(path: Path, experiment: str, settings: Any) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from edge_se_sampler.data.scene_file import SourceLocation, locate_file, quote, read_json
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, locate_file, quote, read_json
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import checksum, write_atomically, write_json
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
@@ -102,6 +102,7 @@ class RunFolder:
         path = self.path / "metrics.jsonl"
         if not path.exists():
             return []
+        SourceFile(path, SourceLocation(path)).check_regular()
         try:
             has_checksums = read_json(self.path / "config.json").object().get("format", 2) > 2
             *complete, rest = path.read_text(encoding="utf-8").split("\n")
@@ -136,7 +137,9 @@ class EventWriter:
             if self._writer is None:
                 from torch.utils.tensorboard import SummaryWriter
 
-                self._writer = SummaryWriter(str(self._folder))
+                self._writer: Any = SummaryWriter(str(self._folder))
+                with contextlib.suppress(AttributeError):  # its thread's failure is raised here: printed once is enough
+                    self._writer.file_writer.event_writer._async_writer._worker._invoke_excepthook = lambda _: None
             for key, value in line.items():
                 if key != "step" and isinstance(value, int | float):
                     self._writer.add_scalar(key, value, line["step"])
