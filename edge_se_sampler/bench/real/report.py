@@ -153,7 +153,7 @@ def _table_of_costs(runs: list[Run]) -> str:
         "steps": lambda group: f"{_median(group, 'steps'):,.0f}",
         "rows": lambda group: f"{_median(group, 'rows') / 1e6:.1f} M",
         "memory": lambda group: f"{_median(group, 'memory'):.1f} GiB",
-        "rendering a view": lambda group: f"{_median(group, 'seconds_per_view'):.2f} s",
+        "rendering and measuring a view": lambda group: f"{_median(group, 'seconds_per_view'):.2f} s",
     }
     rows = (
         [label_of(panel), budget, *(show(group) for show in columns.values())]

@@ -78,7 +78,8 @@ def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -
     Returns:
         size of the images, width and height in pixels; PSNR on each split, None where validation views are the test
         views; SSIM on the test views; steps; seconds of the budget that were used, and CPU seconds; rows of the
-        finest cells; the process's peak of resident memory, GiB; seconds that rendering a test view takes.
+        finest cells; the process's peak of resident memory, GiB; seconds that rendering and measuring
+        a test view take.
     """
     return run_in_subprocess(_train_and_measure, trial, scenes, workplace, settings)
 
