@@ -15,6 +15,7 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.dataset import read_split
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import override
+from edge_se_sampler.engine.pipeline import resolve_depths
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
@@ -108,3 +109,5 @@ def test_the_config_records_depths_and_flags_insist(tmp_path: Path) -> None:
     assert resolve_config(resolved, views) == resolved
     given = resolve_config(override(config, {"pipeline.model.near": 0.5}), views).pipeline.model
     assert (given.near, given.far) == (0.5, model.far)
+    _, source = resolve_depths(views, replace(config.pipeline.model, near=0.5))
+    assert source == f"{find_depths(views).source} and the settings"

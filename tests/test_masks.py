@@ -224,6 +224,14 @@ def test_what_has_no_object_gets_no_masks(tmp_path: Path, images: list[np.ndarra
         assert not (tmp_path / f"{name}.png").exists()
 
 
+def test_the_picture_does_not_take_the_masks_place(tmp_path: Path, images: list[np.ndarray], edge_se: Any) -> None:
+    write_capture(tmp_path / "scene", images)
+    answer = edge_se("masks", "--data", tmp_path / "scene", "--output-path", tmp_path / "scene" / "masks")
+    assert answer.code == 2
+    assert "the masks' folder is to be there" in answer.err
+    assert not (tmp_path / "scene" / "masks").exists()
+
+
 def test_masks_lie_where_colmap_has_them(tmp_path: Path) -> None:
     folder = tmp_path.resolve()
     for image, mask in (

@@ -78,7 +78,8 @@ def resolve_depths(views: Views, config: Model) -> tuple[Model, str]:
     found = find_depths(views)
     near = found.near if config.near is None else config.near
     far = found.far if config.far is None else config.far
-    return replace(config, near=near, far=far), found.source
+    source = found.source if config.near is config.far is None else f"{found.source} and the settings"
+    return replace(config, near=near, far=far), source
 
 
 def build_model(config: TrainerConfig, device: str, grid: BrickGrid | None = None) -> RayModel:

@@ -22,6 +22,7 @@ from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import SourceLocation, quote
 from edge_se_sampler.engine.files import check_output, write_atomically
 from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.masks.segmentation import segment
 
 MAX_SIDE = 400
@@ -45,6 +46,8 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
     frames = _frames(folder, settings)
     places = [_place(folder, frame) for frame in frames]
     targets = sorted({out / place.relative_to(folder).parts[0] for place in places})
+    if picture.resolve() in {target.resolve() for target in targets}:
+        raise InputError(f"--output-path {picture}: the masks' folder is to be there; name another file")
     with staged_folders(out, targets) as workspace:
         images = _read_images(frames)
         lenses = [_scaled_camera(frame, image) for frame, image in zip(frames, images, strict=True)]
