@@ -232,13 +232,13 @@ def _binary_points(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
         yield number, (x, y, z)
 
 
-def _lines(path: Path, most: int = -1) -> Iterator[tuple[SourceLocation, list[str]]]:
-    """The lines of a text file that are no comments, split at blanks, at `most` so many; -1: at all."""
+def _lines(path: Path) -> Iterator[tuple[SourceLocation, str]]:
+    """The lines of a text file that are no comments."""
     location = SourceLocation(path)
     text = _decode(SourceFile(path, location).read_bytes(), location)
     for i, line in enumerate(text.splitlines()):
         if not line.startswith("#"):
-            yield SourceLocation(path, f"line {i + 1}"), line.split(None, most)
+            yield SourceLocation(path, f"line {i + 1}"), line
 
 
 def _numbers(location: SourceLocation, words: list[str]) -> list[float]:
@@ -270,26 +270,26 @@ def _words(location: SourceLocation, words: list[str], count: int) -> list[str]:
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[SourceLocation, int, str, list[float]]]:
-    for location, words in _lines(path):
-        if words:
+    for location, line in _lines(path):
+        if words := line.split():
             number, name, *values = _words(location, words, 4)
             yield location, _ids(location, [number])[0], name, _numbers(location, values)
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    lines = _lines(path, 9)  # a name may have blanks, and several in a row
-    for location, words in lines:
-        if not words:
+    lines = _lines(path)
+    for location, line in lines:
+        if not (words := line.split(None, 9)):  # a name, the tenth, may have blanks
             continue
         motion = _numbers(location, _words(location, words, 10)[1:8])
         (camera_id,) = _ids(location, words[8:9])
-        _, points = next(lines, (location, []))  # an empty line for an image that sees none
-        point_ids = np.array(_ids(location, " ".join(points).split()[2::3]), dtype=np.int64)
+        _, points = next(lines, (location, ""))  # an empty line for an image that sees none
+        point_ids = np.array(_ids(location, points.split()[2::3]), dtype=np.int64)
         yield _image(location, words[9].rstrip(), camera_id, motion, point_ids)
 
 
 def _text_points(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
-    for location, words in _lines(path):
-        if words:
+    for location, line in _lines(path):
+        if words := line.split():
             (number,) = _ids(location, _words(location, words, 4)[:1])
             yield number, tuple(_numbers(location, words[1:4]))
