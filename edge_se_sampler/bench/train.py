@@ -13,6 +13,7 @@ import torch
 
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.evaluation import evaluate
@@ -36,6 +37,16 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
             if not (folder / name).exists():  # another shard has rendered it meanwhile
                 raise
     return folder / name
+
+
+def offcenter_copies(scene: Path, workplace: Path) -> Path:
+    """The folder of a Blender folder's copies by `offcenter`, "centered" and "shifted", in workplace/offcenter, made if
+    missing; raises as `offcenter`."""
+    folder = workplace / "offcenter" / scene.name
+    if not folder.exists():
+        with Progress(0, f"moving {scene.name} off center") as progress:
+            offcenter(scene, folder, progress=progress.update)
+    return folder
 
 
 def train_and_measure(config: TrainerConfig, view_path: Path | None = None) -> Run:

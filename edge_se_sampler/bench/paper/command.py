@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from edge_se_sampler.bench.command import ExperimentCommand
 from edge_se_sampler.bench.runner import Experiment
@@ -16,7 +17,10 @@ class BenchPaper(ExperimentCommand):
     tables: tuple[int, ...] = ()
     """1 to 4 are the paper's, 5 to 18 ours (configs/paper/README.md has their titles); none: all."""
     scenes: tuple[str, ...] = ()
-    """Of the seven synthetic ones, Lego under the name bricks; none: all."""
+    """Of the seven synthetic ones, Lego under the name bricks, and real-lego and real-chair; none: all, the real ones
+    where --scenes-dir is given."""
+    scenes_dir: Path | None = None
+    """Folder with NeRF-synthetic's folders lego and chair."""
     strategies: tuple[str, ...] = ()
     """Of the paper's six, under the methods' names; none: all."""
 
@@ -24,15 +28,28 @@ class BenchPaper(ExperimentCommand):
         from edge_se_sampler.bench.paper import trials as paper
 
         check_known("tables", self.tables, paper.TABLES)
-        check_known("scenes", self.scenes, paper.SCENES)
+        check_known("scenes", self.scenes, (*paper.SCENES, *paper.REAL_SCENES))
         check_known("strategies", self.strategies, paper.LABELS)
-        trials = paper.list_trials(self.tables, self.scenes, self.strategies, self.seeds)
+        scenes = self.scenes or (*paper.SCENES, *(paper.REAL_SCENES if self.scenes_dir else ()))
+        folders = {scene: self._find_real_scene(scene) for scene in scenes if scene in paper.REAL_SCENES}
+        trials = paper.list_trials(self.tables, scenes, self.strategies, self.seeds)
         if not trials:
             raise InputError("--tables and --strategies: no chosen table has a chosen strategy")
         settings = paper.Settings()
 
         def arguments(trial: paper.Trial) -> tuple[object, ...]:
-            data = paper.synthetic_scene(trial.table, trial.scene, settings, self.workplace)
+            if real := folders.get(trial.scene):
+                data = paper.placed_copy(trial.table, real, self.workplace)
+            else:
+                data = paper.synthetic_scene(trial.table, trial.scene, settings, self.workplace)
             return settings, data, self.workplace
 
         return Experiment("paper", settings, lambda _: trials, paper.run_trial, arguments)
+
+    def _find_real_scene(self, scene: str) -> Path:
+        if self.scenes_dir is None:
+            raise InputError(f"--scenes {scene} needs --scenes-dir, the folder of NeRF-synthetic's scenes")
+        folder = self.scenes_dir.resolve() / scene.removeprefix("real-")
+        if not folder.is_dir():
+            raise InputError(f"--scenes-dir {self.scenes_dir}: has no folder {folder.name}; give the scenes' folder")
+        return folder

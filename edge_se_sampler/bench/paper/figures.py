@@ -6,7 +6,9 @@ each split, PLACEMENT-SCENE-{train,test}.png.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from contextlib import suppress
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from edge_se_sampler.bench.outcomes import failed
-from edge_se_sampler.bench.paper.published import LABELS, SCENES
+from edge_se_sampler.bench.paper.published import LABELS, REAL_SCENES, SCENES
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, TABLES, Trial, runs_by_trial
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
@@ -29,7 +31,8 @@ Runs = dict[Trial, Run]
 
 def draw_figures(runs: list[Run], views: Path, folder: Path) -> None:
     """Draw every picture of which all runs and renderings are there; leave the others as they are."""
-    for name, draw in {"sheet": _sheet, "figure-2": _figure_2}.items():
+    pictures = {"sheet": partial(_sheet, SCENES), "sheet-real": partial(_sheet, REAL_SCENES), "figure-2": _figure_2}
+    for name, draw in pictures.items():
         with suppress(FileNotFoundError):
             figure = draw(runs_by_trial(runs), views)
             if figure is not None:
@@ -56,14 +59,15 @@ def _show_rendering(axis: Any, runs: Runs, trial: Trial, views: Path, frame: str
     _show(axis, image, FAILED if run and failed(run) else frame)
 
 
-def _sheet(runs: Runs, views: Path) -> Any:
-    """The renderings of tables 1 to 4; a failed training has a red frame."""
-    scenes = [scene for scene in SCENES if any(trial.scene == scene for trial in runs)]
+def _sheet(of: Collection[str], runs: Runs, views: Path) -> Any:
+    """The renderings of tables 1 to 4 on some scenes; a failed training has a red frame."""
+    runs = {trial: run for trial, run in runs.items() if trial.scene in of and trial.table in PAPER_TABLES}
+    scenes = [scene for scene in of if any(trial.scene == scene for trial in runs)]
     tables = [number for number in PAPER_TABLES if any(trial.table == number for trial in runs)]
     if not tables:
         return None
     seed = min(trial.seed for trial in runs)
-    width, height = 0.62 * len(scenes) + 1.3, 0.62 * (len(LABELS) + 1) + 0.6
+    width, height = max(0.62 * len(scenes) + 1.3, 3.2), 0.62 * (len(LABELS) + 1) + 0.6
     rows, columns = -(-len(tables) // 2), min(2, len(tables))
     figure = require_pyplot().figure(figsize=(width * columns, height * rows))
     parts = np.ravel(figure.subfigures(rows, columns, squeeze=False))

@@ -8,10 +8,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from edge_se_sampler.bench.paper.published import LABELS, SCENES
+from edge_se_sampler.bench.paper.published import LABELS, REAL_SCENES, SCENES
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.train import cached_scene, train_and_measure
+from edge_se_sampler.bench.train import cached_scene, offcenter_copies, train_and_measure
 from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.frames import LoadSettings
 from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, MachineConfig, TrainerConfig, override
 from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.methods import method_configs
@@ -84,6 +85,10 @@ class Settings:
     num_test: int = 4
 
 
+REAL_DOWNSCALE = 12
+"""Of the real scenes' images, 800 pixels wide and high: about as large as `Settings.image_size`."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """One training."""
@@ -106,8 +111,8 @@ def runs_by_trial(runs: list[Run]) -> dict[Trial, Run]:
 def list_trials(
     tables: Sequence[int], scenes: Sequence[str], strategies: Sequence[str], seeds: Sequence[int]
 ) -> list[Trial]:
-    """All chosen trainings (nothing chosen: all): the paper's seed by seed, then ours, so that an unfinished experiment
-    is a smaller one."""
+    """All chosen trainings (no tables or strategies: all; no scenes: the synthetic ones): the paper's seed by seed,
+    then ours, so that an unfinished experiment is a smaller one."""
     trials = [
         Trial(table, scene, strategy, seed)
         for seed, table, scene in product(seeds, tables or TABLES, scenes or SCENES)
@@ -124,6 +129,7 @@ def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path)
     iterations = round(table.steps * (settings.info_iterations if table.method == "info-nerf" else settings.iterations))
     changes = {
         "data": data,
+        "downscale": REAL_DOWNSCALE if trial.scene in REAL_SCENES else 1,
         "output_dir": output_dir,
         "experiment_name": trial.name,
         "max_num_iterations": iterations,
@@ -148,8 +154,16 @@ def run_trial(trial: Trial, settings: Settings, data: Path, workplace: Path) -> 
         path = views / f"{TABLES[trial.table].placement}-{trial.scene}-{split}.png"
         if not path.exists():
             views.mkdir(parents=True, exist_ok=True)
-            write_image(path, unit_float(read_blender(data, split).images[0]))
+            downscale = REAL_DOWNSCALE if trial.scene in REAL_SCENES else 1
+            write_image(path, unit_float(read_blender(data, split, LoadSettings(downscale=downscale)).images[0]))
     return train_and_measure(build_config(trial, settings, data, workplace / "runs"), views / f"{trial.name}.png")
+
+
+def placed_copy(table: int, folder: Path, workplace: Path) -> Path:
+    """A real scene's folder as a table's trials see it: itself, or a copy, made where it is missing."""
+    copies = {"padded": "centered", "shifted": "shifted"}
+    copy = copies.get(TABLES[table].placement)
+    return folder if copy is None else offcenter_copies(folder, workplace) / copy
 
 
 def synthetic_scene(table: int, scene: str, settings: Settings, workplace: Path) -> Path:

@@ -34,8 +34,10 @@ STRATEGIES = {
 class Setting:
     """What is trained on what; the defaults are the base setting."""
 
-    foreground: float = 0.05
-    """Share of an image's pixels that show the object, a mean over the views."""
+    scene: str | None = None
+    """Folder of a real scene; None: a synthetic one."""
+    foreground: float | None = 0.05
+    """Share of an image's pixels that show the object, a mean over the views; None: a real scene as it is."""
     placement: Literal["centered", "shifted"] = "centered"
     num_views: int = 40
     background: Background = "white"
@@ -72,10 +74,22 @@ PAIRS: tuple[dict[str, Any], ...] = (
 """Small and off centre; off centre and few views; what PyTorch ports start with, and softplus, which may help them."""
 
 
-SETTINGS = {
+SYNTHETIC_SETTINGS = {
     ", ".join(AXES[axis][0].format(value) for axis, value in changes.items()) or "base": Setting(**changes)
     for changes in ({}, *({axis: value} for axis, (_, values) in AXES.items() for value in values), *PAIRS)
 }
+REAL_SETTINGS = {
+    f"real {scene}, {label}": Setting(scene=scene, **changes)
+    for scene in ("lego", "chair")
+    for label, changes in {
+        "as it is": {"foreground": None},
+        "as it is, 10 views": {"foreground": None, "num_views": 10},
+        "object 5%": {},
+        "object 2%": {"foreground": 0.02},
+        "object 5%, off centre": {"placement": "shifted"},
+    }.items()
+}
+SETTINGS = SYNTHETIC_SETTINGS | REAL_SETTINGS
 """Label, which says what differs from the base setting -> setting."""
 
 

@@ -13,8 +13,9 @@ from typing import Any
 import torch
 
 from edge_se_sampler.bench.outcomes import Outcome, classify
-from edge_se_sampler.bench.stability.scenes import COLORS, NUM_TRAIN, background_of, render_splits
+from edge_se_sampler.bench.stability.scenes import COLORS, NUM_TRAIN, background_of, read_real_splits, render_splits
 from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES, Setting, Trial
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import MANAGER, MODEL, override
 from edge_se_sampler.engine.metrics import psnr
 from edge_se_sampler.engine.pipeline import Pipeline, build_model
@@ -39,8 +40,8 @@ class TrainingSize:
     """Coarse ones, and as many importance samples."""
 
 
-def run_trial(trial: Trial, size: TrainingSize) -> dict[str, Any]:
-    """Train once; called in a process of its own.
+def run_trial(trial: Trial, size: TrainingSize, scenes_dir: Path | None = None) -> dict[str, Any]:
+    """Train once; called in a process of its own. scenes_dir: of the real scenes.
 
     Returns:
         outcome and failure_mode; what `measure_views` measures; which networks were dead_at_start; how many were
@@ -50,7 +51,9 @@ def run_trial(trial: Trial, size: TrainingSize) -> dict[str, Any]:
     disable_malloc_trimming()
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
-        trainer, pictures = build_trainer(SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder))
+        trainer, pictures = build_trainer(
+            SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder), scenes_dir
+        )
         model = trainer.pipeline.model
         dead = dead_networks(model, [picture.rays(model.device)[::2] for picture in pictures])
         for step in range(size.iterations):
@@ -77,11 +80,10 @@ def failure_mode(outcome: Outcome, accumulation: float, dead_at_start: bool) -> 
 
 
 def build_trainer(
-    setting: Setting, strategy: str, seed: int, size: TrainingSize, folder: Path
+    setting: Setting, strategy: str, seed: int, size: TrainingSize, folder: Path, scenes_dir: Path | None = None
 ) -> tuple[Trainer, list[Picture]]:
     """A training that is ready to begin, its run in a folder, and its held-out views."""
-    train, test = render_splits(setting.foreground, setting.placement == "shifted", NUM_TRAIN)
-    train = train.subset(range(setting.num_views))
+    train, test = _read_splits(setting, scenes_dir)
     changes = {
         "output_dir": folder,
         "experiment_name": "stability",
@@ -107,6 +109,17 @@ def build_trainer(
     pipeline = Pipeline(datamanager, build_model(config, "cpu"))
     pipeline.model.background_fn = background_of(setting.background)
     return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), to_pictures(test)
+
+
+def _read_splits(setting: Setting, scenes_dir: Path | None) -> tuple[Views, Views]:
+    """Training and held-out views."""
+    shifted = setting.placement == "shifted"
+    if setting.scene is not None:
+        assert scenes_dir is not None  # the command insists on it
+        return read_real_splits(scenes_dir / setting.scene, setting.foreground, shifted, setting.num_views)
+    assert setting.foreground is not None  # of real scenes alone
+    train, test = render_splits(setting.foreground, shifted, NUM_TRAIN)
+    return train.subset(range(setting.num_views)), test
 
 
 def measure_views(model: NeRFModel, pictures: list[Picture]) -> dict[str, float]:

@@ -35,7 +35,8 @@ class BenchStrategies(ExperimentCommand):
     """Ways of choosing pixels; none: all. --dry-run lists their names."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.strategies.trials import STRATEGIES, Settings, list_trials, run_trial, shifted_copy
+        from edge_se_sampler.bench.strategies.trials import STRATEGIES, Settings, list_trials, run_trial
+        from edge_se_sampler.bench.train import offcenter_copies
 
         check_known("strategies", self.strategies, STRATEGIES)
         check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
@@ -48,6 +49,6 @@ class BenchStrategies(ExperimentCommand):
 
         def arguments(trial: Trial) -> tuple[Settings, Path]:
             scene = scenes_dir / trial.scene
-            return settings, scene if trial.placement == "centered" else shifted_copy(scene, workplace)
+            return settings, scene if trial.placement == "centered" else offcenter_copies(scene, workplace) / "shifted"
 
         return Experiment("strategies", settings, lambda _: trials, run_trial, arguments)

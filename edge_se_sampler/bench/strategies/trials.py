@@ -24,14 +24,12 @@ from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import Run
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
-from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import MODEL, SAMPLER, TrainerConfig, override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import Pipeline
 from edge_se_sampler.engine.plan import Plan
-from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import disable_malloc_trimming, resolve_config
@@ -142,15 +140,6 @@ def list_trials(
         )
         if model in STRATEGIES[strategy].models
     ]
-
-
-def shifted_copy(scene: Path, workplace: Path) -> Path:
-    """The off-center copy of a Blender folder, in workplace/offcenter, made if missing; raises as `offcenter`."""
-    folder = workplace / "offcenter" / scene.name
-    if not folder.exists():
-        with Progress(0, f"moving {scene.name} off center") as progress:
-            offcenter(scene, folder, progress=progress.update)
-    return folder / "shifted"
 
 
 def build_config(trial: Trial, settings: Settings, output_dir: Path) -> TrainerConfig:
