@@ -168,14 +168,17 @@ def folder_of(folder: Path, runs: list[dict[str, Any]], errors: tuple[dict[str, 
 PANEL = Panel("lean", 4, "centered")
 
 
+FAILED = {"uniform": [("lego", 1), ("chair", 0)], "edge": [("lego", 1), ("lego", 2)], "se-cached": []}
+
+
 def random_runs() -> list[dict[str, Any]]:
-    """Three strategies, of which `edge` lacks a seed on chair."""
+    """Three strategies, of which `edge` lacks a seed on chair; `FAILED` lists the scenes and seeds that fail."""
     rng = np.random.default_rng(0)
     return [
         run_of(
             rng.normal(25, 1), seed, strategy, scene=scene, plan=plan, placement=placement,
             foreground_psnr=rng.normal(20, 1), edge_band_psnr=rng.normal(18, 1), seconds=rng.uniform(8, 12),
-            steps=int(rng.integers(100, 200)), outcome=rng.choice(["converged", "collapsed", "underfit"]),
+            steps=int(rng.integers(100, 200)), outcome="underfit" if (scene, seed) in FAILED[strategy] else "converged",
         )
         for strategy, scene, plan, placement, seed in product(
             ("uniform", "edge", "se-cached"), ("lego", "chair"), ("seconds", "steps"), ("centered", "shifted"), range(4)
@@ -195,18 +198,19 @@ def test_numbers_are_those_of_brute_force() -> None:
     for plan in ("seconds", "steps"):
         found = compare(runs, PANEL, "edge", plan)
         assert found is not None
-        psnrs = {scene: [at("edge", scene, plan, seed)["psnr"] for seed in seeds[scene]] for scene in seeds}
-        before = {scene: [at("uniform", scene, plan, seed)["psnr"] for seed in seeds[scene]] for scene in seeds}
-        assert found.psnr == pytest.approx((np.median(psnrs["lego"]) + np.median(psnrs["chair"])) / 2)
-        spreads = [np.mean([np.ptp(values) for values in of_seeds.values()]) for of_seeds in (psnrs, before)]
+        pairs = {s: [(at("edge", s, plan, i), at("uniform", s, plan, i)) for i in seeds[s]] for s in seeds}
+        medians = [np.median([edge["psnr"] for edge, _ in of_scene]) for of_scene in pairs.values()]
+        assert found.psnr == pytest.approx(sum(medians) / 2)
+        alive = [
+            [[r["psnr"] for p in pairs[s] if (r := p[i])["outcome"] == "converged"] for s in seeds] for i in (0, 1)
+        ]
+        spreads = [np.mean([np.ptp(psnrs) for psnrs in of_scenes]) for of_scenes in alive]
         assert found.spread == pytest.approx(max(spreads))
+        pairs = {s: [p for p in pairs[s] if "converged" in (p[0]["outcome"], p[1]["outcome"])] for s in seeds}
         for metric in ("psnr", "foreground_psnr", "edge_band_psnr"):
-            medians = [
-                np.median([at("edge", s, plan, i)[metric] - at("uniform", s, plan, i)[metric] for i in seeds[s]])
-                for s in seeds
-            ]
+            medians = [np.median([edge[metric] - uniform[metric] for edge, uniform in pairs[s]]) for s in seeds]
             assert found.differences[metric] == pytest.approx(sum(medians) / 2)
-        assert len(found.pairs) == 7
+        assert len(found.pairs) == sum(map(len, pairs.values())) < 7
     ratios = []
     for scene, numbers in seeds.items():
         for seed in numbers:
@@ -273,7 +277,7 @@ def test_the_page_shows_the_numbers(tmp_path: Path) -> None:
     assert edge == (
         "| edge | 26.20 (0.40) | **+1.10** | +1.10 | +1.10 | 25.05 (0.10) | +0.05 | +0.05 | +0.05 | x2.00 | 0 of 4 |"
     )
-    assert "| uniform | 25.10 (0.20) | – | – | – | 25.00 (0.00) | – | – | – | x1.00 | 2 of 4 |" in page
+    assert "| uniform | 25.10 (0.20) | – | – | – | 25.00 | – | – | – | x1.00 | 2 of 4 |" in page
     assert "| lean, 200 px | edge | +1.10 | better |" in page
     assert "| lean +1.10, a step x2.00 | yes, better: lean, 200 px |" in tables(tmp_path)["strategies"]
     assert "broken" in page

@@ -1,8 +1,9 @@
 """What the runs say of each strategy against uniform pixels, panel by panel: a model on images of a size, centered or
 not.
 
-Differences are taken between trainings of the same scene and seed, and means over scenes of the median over seeds. The
-spread of a number is the mean over scenes of its greatest minus its least value over seeds.
+Differences are taken between trainings of the same scene and seed, not both of which failed, and means over scenes of
+the median over seeds. The spread of a number is the mean over scenes of its greatest minus its least value over the
+seeds that did not fail: failures are counted, and would drown all else.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ class Comparison:
 
     psnr: float
     spread: float | None
-    """The greater of its own and of uniform's; None: some scene has a single seed."""
+    """The greater of its own and of uniform's that is known; None: neither, see `_spread`."""
     differences: dict[str, float]
-    """By metric, over the trainings that uniform pixels have too; empty: none."""
+    """By metric, over the trainings that uniform pixels have too and that did not both fail; empty: none."""
     pairs: list[float]
     """Differences of PSNR, one a scene and seed."""
 
@@ -83,7 +84,7 @@ def compare(runs: list[Run], panel: Panel, strategy: str, plan: str) -> Comparis
     own, uniform = select(runs, panel, strategy, plan), select(runs, panel, UNIFORM, plan)
     if not own:
         return None
-    pairs = _pair(own, uniform)
+    pairs = [pair for pair in _pair(own, uniform) if not all(map(failed, pair))]
     differences, spreads = {}, [_spread(own)]
     if pairs and strategy != UNIFORM:
         for metric in METRICS:
@@ -92,7 +93,7 @@ def compare(runs: list[Run], panel: Panel, strategy: str, plan: str) -> Comparis
         spreads.append(_spread([before for _, before in pairs]))
     return Comparison(
         psnr=statistics.mean(map(statistics.median, _by_scene((run["scene"], run["psnr"]) for run in own).values())),
-        spread=None if None in spreads else max(spread for spread in spreads if spread is not None),
+        spread=max((spread for spread in spreads if spread is not None), default=None),
         differences=differences,
         pairs=[run["psnr"] - before["psnr"] for run, before in pairs],
     )
@@ -140,8 +141,8 @@ def _by_scene(values: Iterable[tuple[str, float]]) -> dict[str, list[float]]:
 
 
 def _spread(runs: Sequence[Run]) -> float | None:
-    """Of PSNR; None if some scene has a single seed."""
-    by_scene = _by_scene((run["scene"], run["psnr"]) for run in runs)
-    if any(len(psnrs) < 2 for psnrs in by_scene.values()):
+    """Of PSNR of the runs that did not fail; None if some scene has less than two of them."""
+    by_scene = _by_scene((run["scene"], run["psnr"]) for run in runs if not failed(run))
+    if by_scene.keys() != {run["scene"] for run in runs} or any(len(psnrs) < 2 for psnrs in by_scene.values()):
         return None
     return statistics.mean(max(psnrs) - min(psnrs) for psnrs in by_scene.values())
