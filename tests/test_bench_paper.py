@@ -16,7 +16,7 @@ import pytest
 from edge_se_sampler.bench import command, runner
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, published
-from edge_se_sampler.bench.paper.report import psnr_table
+from edge_se_sampler.bench.paper.report import describe, psnr_table
 from edge_se_sampler.bench.paper.trials import (
     PAPER_TABLES,
     TABLES,
@@ -24,6 +24,7 @@ from edge_se_sampler.bench.paper.trials import (
     Trial,
     build_config,
     list_trials,
+    placed_copy,
     run_trial,
     synthetic_scene,
 )
@@ -114,6 +115,21 @@ def test_a_trial_is_measured_and_leaves_its_rendering(tmp_path: Path) -> None:
     }
 
 
+def test_a_trial_of_a_real_scene_reads_it_smaller(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper, "REAL_DOWNSCALE", 2)
+    trial = Trial(2, "real-lego", "edge-nerf", 1)
+    assert placed_copy(1, scene, tmp_path) == scene
+    shifted = placed_copy(2, scene, tmp_path)
+    assert placed_copy(16, scene, tmp_path) == shifted.parent / "centered"
+    assert run_trial(trial, SMALL, shifted, tmp_path)["steps"] == 4
+    views = {path.name: iio.imread(path).shape for path in (tmp_path / "paper" / "views").iterdir()}
+    assert views == {  # 24 x 24, padded by a fifth and by 0.15 of that on either side, and halved
+        f"{trial.name}.png": (16, 17, 3),
+        "shifted-real-lego-train.png": (16, 17, 4),
+        "shifted-real-lego-test.png": (16, 17, 4),
+    }
+
+
 @pytest.mark.slow
 def test_a_trial_gives_the_same_run_in_another_process(tmp_path: Path) -> None:
     trial = Trial(1, "mic", "vanilla-nerf", 0)
@@ -160,6 +176,41 @@ def test_every_scene_counts_alike_in_the_mean() -> None:
     (row,) = [line for line in psnr_table(2, edge).splitlines() if line.startswith("| Edge |")]
     assert row.split(" | ")[1:3] == ["21.00 ± 1.00 <sub>27.13</sub>", "30.50 ± 0.71 <sub>29.38</sub>"]
     assert row.split(" | ")[3].startswith("25.75 <sub>")
+
+
+def test_real_scenes_have_columns_of_their_own() -> None:
+    real = [make_run("edge-nerf", seed, psnr, scene="real-lego") for seed, psnr in enumerate((40.0, 41.0))]
+    table = psnr_table(2, [*RUNS, *real])
+    head, _, random, edge = table.splitlines()
+    assert head == "|  | mic | mean | CPU s | real-lego |"
+    assert random.endswith("| 10.5 | – |")
+    cell = "30.50 ± 0.71 <sub>29.38</sub>"
+    assert edge == f"| Edge | {cell} | {cell} | 10.5 | 40.50 ± 0.71 <sub>29.56</sub> |"
+    assert psnr_table(2, real).splitlines()[0] == "|  | real-lego |"
+
+
+def test_the_page_says_where_real_scenes_disagree(tmp_path: Path) -> None:
+    def run(strategy: str, scene: str, seed: int, psnr: float) -> dict[str, Any]:
+        measured = {"outcome": "converged", "edge_band_psnr": psnr, "dead_at_start": []}
+        return {**make_run(strategy, seed, psnr, scene=scene), "table": 1, **measured}
+
+    gains = {"mic": 1.0, "real-chair": 1.0, "real-lego": 1.0}
+    for se_on_real, disagree in ((1.0, False), (-1.0, True)):
+        gains["real-chair"] = gains["real-lego"] = se_on_real
+        runs = [
+            run(strategy, scene, seed, 20 + seed / 100 + gain * (strategy == "se-nerf"))
+            for scene, gain in gains.items()
+            for strategy in ("vanilla-nerf", "se-nerf")
+            for seed in range(5)
+        ]
+        result = runner.new_result("paper", asdict(Settings())) | {"errors": [], "runs": runs}
+        runner.write_result(tmp_path / "result.json", result)
+        page = describe(tmp_path)
+        line = "- SE raises PSNR whatever the early phase, at equal steps: supported on the synthetic scenes, not "
+        assert (line in page) == disagree
+        assert ("## Where real scenes say something else" in page) == disagree
+        assert "| **supported** | 1 above, 0 below, of 1 | **" + "not " * disagree + "supported** |" in page
+        assert "10 trainings" in page
 
 
 # -- the command
@@ -218,6 +269,8 @@ def test_a_dry_run_trains_and_writes_nothing(tmp_path: Path, edge_se: Callable[.
         (("--tables", "99"), "--tables: 99 is none of 1, 2, 3, 4"),
         (("--tables", "13", "--strategies", "se-nerf"), "no chosen table has a chosen strategy"),
         (("--scenes", "lego"), "--scenes: 'lego'"),
+        (("--scenes", "real-lego"), "needs --scenes-dir"),
+        (("--scenes-dir", "nowhere"), "--scenes-dir nowhere: has no folder lego"),
         (("--strategies", "edge"), "--strategies: 'edge'"),
         (("--workers", "0"), "--workers is 0: must be at least 1"),
         (("--scheduler", "nowhere"), "--scheduler"),

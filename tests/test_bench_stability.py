@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import torch
 
 from edge_se_sampler.bench import command
 from edge_se_sampler.bench.outcomes import Outcome
+from edge_se_sampler.bench.runner import new_result, write_result
 from edge_se_sampler.bench.stability import report, scenes
 from edge_se_sampler.bench.stability import train as train_module
-from edge_se_sampler.bench.stability.scenes import COLORS, background_of, render_splits
+from edge_se_sampler.bench.stability.scenes import COLORS, background_of, read_real_splits, render_splits
 from edge_se_sampler.bench.stability.settings import AXES, PAIRS, SETTINGS, SYNTHETIC_SETTINGS, Setting, Trial
 from edge_se_sampler.bench.stability.train import (
     TrainingSize,
@@ -25,6 +27,9 @@ from edge_se_sampler.bench.stability.train import (
     measure_views,
     run_trial,
 )
+from edge_se_sampler.bench.train import cached_scene
+from edge_se_sampler.data.blender import read_blender
+from edge_se_sampler.data.downscale import average_pixels
 from edge_se_sampler.engine.reinitialization import dead_networks
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.models.nerf import NeRFModel
@@ -72,6 +77,26 @@ def test_off_centre_shows_the_same_picture_shifted_by_whole_pixels() -> None:
         np.testing.assert_array_equal(after, np.roll(before, (dy, dx), axis=(0, 1)))
     assert (shifted.cameras.cx - centered.cameras.cx).eq(dx).all()
     assert (shifted.cameras.cy - centered.cameras.cy).eq(dy).all()
+
+
+def test_a_real_scene_is_as_small_and_where_a_setting_wants_it(tmp_path: Path) -> None:
+    folder = cached_scene(tmp_path, "mic", size=96, num_train=9, num_val=1, num_test=6)
+    whole, test = read_real_splits(folder, None, False, 5)
+    assert (len(whole.images), len(test.images)) == (5, scenes.NUM_TEST)
+    np.testing.assert_array_equal(whole.images[1], average_pixels(read_blender(folder, "train").images[2], 4))
+    share = np.mean([image[..., 3] > 0 for image in whole.images])
+    small, _ = read_real_splits(folder, share / 4, False, 5)
+    assert np.mean([image[..., 3] > 0 for image in small.images]) == pytest.approx(share / 4, rel=0.25)
+    shifted, _ = read_real_splits(folder, share / 4, True, 5)
+    dx, dy = scenes.SHIFT
+    for before, after in zip(small.images, shifted.images, strict=True):
+        np.testing.assert_array_equal(after, np.roll(before, (dy, dx), axis=(0, 1)))
+    for views, dx, dy in ((whole, 0, 0), (small, 0, 0), (shifted, *scenes.SHIFT)):
+        factor = round(float(read_blender(folder, "train").cameras.fx[0] / views.cameras.fx[0]))
+        corner = (24 - 96 // factor) // 2
+        axis = -views.cameras.camera_to_worlds[2, :, 2]  # seen in the middle of the scene's own images
+        middle = torch.tensor([[corner + 48 / factor + dy, corner + 48 / factor + dx]], dtype=torch.float64)
+        torch.testing.assert_close(views.cameras.generate_rays(torch.tensor([[2]]), middle).directions[0], axis)
 
 
 def test_backgrounds() -> None:
@@ -204,6 +229,19 @@ def test_the_tables_count_failures_and_failure_modes() -> None:
     assert "| Random | 3 of 10 | 0 | 2 | 1 | 0 | 0 | 0 |" in report.tabulate_strategies(counts)
 
 
+def test_real_scenes_are_counted_apart(tmp_path: Path) -> None:
+    labels = {"base": None, "real lego, object 2%": "emptied"}
+    runs = [
+        {"setting": label, "strategy": "edge-nerf", "seed": seed, "outcome": "-", "failure_mode": mode}
+        for label, mode in labels.items()
+        for seed in range(2)
+    ]
+    write_result(tmp_path / "result.json", new_result("stability", asdict(SMALL)) | {"errors": [], "runs": runs})
+    page = report.describe(tmp_path)
+    assert "| Edge | 0 of 2 |" in page
+    assert page.index("| base | 0/2") < page.index("## On real scenes") < page.index("| real lego, object 2% | **2/2**")
+
+
 def test_the_command_trains_and_reports_a_small_sweep(
     tmp_path: Path, edge_se: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,6 +264,8 @@ def test_the_command_trains_and_reports_a_small_sweep(
         (("--settings", "99"), "--settings: '99'"),
         (("--strategies", "se"), "--strategies: 'se'"),
         (("--workers", "0"), "--workers"),
+        (("--settings", "real lego, object 5%"), "need --scenes-dir"),
+        (("--scenes-dir", "nowhere"), "--scenes-dir nowhere: has no folder"),
     ],
 )
 def test_flags_without_meaning_are_refused(flags: tuple[str, ...], named: str, tmp_path: Path, edge_se: Any) -> None:

@@ -106,7 +106,8 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
     """Hardware and versions in a line."""
     versions = ", ".join(f"{name} {machine[name]}" for name in ("python", "torch", "numpy"))
     counts = (f"{machine[key]} {key.removesuffix('s') if machine[key] == 1 else key}" for key in ("cores", "threads"))
-    return f"{machine['processor']}, {', '.join(counts)}; {versions}"
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    return f"{machine['processor']}, {', '.join(counts)}{gpu}; {versions}"
 
 
 def describe_command(*results: Mapping[str, Any]) -> str:

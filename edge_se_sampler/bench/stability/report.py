@@ -10,7 +10,7 @@ from typing import Any
 from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN
 from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table
 from edge_se_sampler.bench.runner import Run, read_result
-from edge_se_sampler.bench.stability.settings import SETTINGS, STRATEGIES
+from edge_se_sampler.bench.stability.settings import REAL_SETTINGS, SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
 
 FAILURE_MODES = {
@@ -24,16 +24,21 @@ Modes = Counter[Any]
 def describe(folder: Path) -> str:
     """README.md of the sweep in a folder."""
     result = read_result(folder / "result.json")
-    counts = count_failure_modes(result["runs"])
+    runs, real_runs = (
+        [run for run in result["runs"] if (run["setting"] in REAL_SETTINGS) == is_real] for is_real in (False, True)
+    )
+    counts, real_counts = count_failure_modes(runs), count_failure_modes(real_runs)
     return fill_template(
         __file__,
         folder,
         **result["settings"],
-        seeds=len({run["seed"] for run in result["runs"]}),
+        seeds=len({run["seed"] for run in runs}),
         collapsed_share=COLLAPSED_SHARE,
         min_gain=MIN_GAIN,
         strategies=tabulate_strategies(counts),
         settings=tabulate_settings(counts),
+        real_seeds=len({run["seed"] for run in real_runs}) or "",
+        real_settings=tabulate_settings(real_counts) if real_runs else "",
         reproduce=describe_command(result),
     )
 
