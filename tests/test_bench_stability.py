@@ -264,7 +264,7 @@ def test_the_command_trains_and_reports_a_small_sweep(
         (("--settings", "99"), "--settings: '99'"),
         (("--strategies", "se"), "--strategies: 'se'"),
         (("--workers", "0"), "--workers"),
-        (("--settings", "real lego, object 5%"), "need --scenes-dir"),
+        (("--settings", "real lego, object 5%"), "needs --scenes-dir"),
         (("--scenes-dir", "nowhere"), "--scenes-dir nowhere: has no folder"),
     ],
 )

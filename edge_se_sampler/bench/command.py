@@ -13,7 +13,17 @@ from edge_se_sampler.bench.report import write_report
 from edge_se_sampler.bench.runner import ALL, Experiment, Shard, executor_factory, list_trials, run_experiment
 from edge_se_sampler.bench.statistics import require_scipy_stats
 from edge_se_sampler.engine.figures import require_pyplot
-from edge_se_sampler.errors import check_value
+from edge_se_sampler.errors import InputError, check_value
+
+
+def find_scene(scenes_dir: Path | None, name: str) -> Path:
+    """A scene's folder in --scenes-dir, absolute; InputError if it is not there, or no folder of scenes was given."""
+    if scenes_dir is None:
+        raise InputError(f"the scene {name} needs --scenes-dir, the folder of NeRF-synthetic's scenes")
+    folder = scenes_dir.resolve() / name
+    if not folder.is_dir():
+        raise InputError(f"--scenes-dir {scenes_dir}: has no folder {name}; give the folder of the scenes")
+    return folder
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand, find_scene
 from edge_se_sampler.bench.runner import Experiment
 from edge_se_sampler.errors import InputError, check_known
 
@@ -31,7 +31,11 @@ class BenchPaper(ExperimentCommand):
         check_known("scenes", self.scenes, (*paper.SCENES, *paper.REAL_SCENES))
         check_known("strategies", self.strategies, paper.LABELS)
         scenes = self.scenes or (*paper.SCENES, *(paper.REAL_SCENES if self.scenes_dir else ()))
-        folders = {scene: self._find_real_scene(scene) for scene in scenes if scene in paper.REAL_SCENES}
+        folders = {
+            scene: find_scene(self.scenes_dir, scene.removeprefix("real-"))
+            for scene in scenes
+            if scene in paper.REAL_SCENES
+        }
         trials = paper.list_trials(self.tables, scenes, self.strategies, self.seeds)
         if not trials:
             raise InputError("--tables and --strategies: no chosen table has a chosen strategy")
@@ -45,11 +49,3 @@ class BenchPaper(ExperimentCommand):
             return settings, data, self.workplace
 
         return Experiment("paper", settings, lambda _: trials, paper.run_trial, arguments)
-
-    def _find_real_scene(self, scene: str) -> Path:
-        if self.scenes_dir is None:
-            raise InputError(f"--scenes {scene} needs --scenes-dir, the folder of NeRF-synthetic's scenes")
-        folder = self.scenes_dir.resolve() / scene.removeprefix("real-")
-        if not folder.is_dir():
-            raise InputError(f"--scenes-dir {self.scenes_dir}: has no folder {folder.name}; give the scenes' folder")
-        return folder

@@ -50,7 +50,7 @@ def describe(folder: Path) -> str:
         failure_rule=FAILURE_RULE,
         summary=_summarize(runs),
         num_real_runs=len(real_runs) or "",
-        real_size=800 // REAL_DOWNSCALE,
+        real_size=800 // REAL_DOWNSCALE if real_runs else "",
         real_summary=_summarize(real_runs) if real_runs else "",
         disagreements=_list_disagreements(claims, on_real),
         claims=markdown_table(

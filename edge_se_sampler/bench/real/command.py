@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand, find_scene
 from edge_se_sampler.bench.runner import Experiment
-from edge_se_sampler.errors import InputError, check_known, check_value
+from edge_se_sampler.errors import check_known, check_value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,10 +38,7 @@ class BenchReal(ExperimentCommand):
         for budget in self.budgets:
             override(method_configs()["lean-nerf"], training_length(budget)).check_plan()
         for scene in self.scenes:
-            if not (self.scenes_dir / scene).is_dir():
-                raise InputError(
-                    f"--scenes-dir {self.scenes_dir}: has no folder {scene}; give the folder of the scenes"
-                )
+            find_scene(self.scenes_dir, scene)
         every = product(self.seeds, self.downscales, self.budgets, self.scenes, self.variants)
         trials = [Trial(scene, down, budget, variant, seed) for seed, down, budget, scene, variant in every]
         settings, scenes_dir, workplace = Settings(), self.scenes_dir.resolve(), self.workplace.resolve()

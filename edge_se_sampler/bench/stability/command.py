@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand, find_scene
 from edge_se_sampler.bench.runner import Experiment
-from edge_se_sampler.errors import InputError, check_known
+from edge_se_sampler.errors import check_known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,13 +33,14 @@ class BenchStability(ExperimentCommand):
         check_known("settings", self.settings, SETTINGS)
         check_known("strategies", self.strategies, STRATEGIES)
         chosen = self.settings or (SYNTHETIC_SETTINGS if self.scenes_dir is None else SETTINGS)
-        for scene in {SETTINGS[label].scene or "" for label in chosen} - {""}:
-            if self.scenes_dir is None:
-                raise InputError("--settings of real scenes need --scenes-dir, the folder of NeRF-synthetic's scenes")
-            if not (self.scenes_dir / scene).is_dir():
-                raise InputError(f"--scenes-dir {self.scenes_dir}: has no folder {scene}; give the scenes' folder")
+        scenes = {scene for label in chosen if (scene := SETTINGS[label].scene) is not None}
+        folders = {scene: find_scene(self.scenes_dir, scene) for scene in scenes}
         # seed by seed, so that an unfinished sweep covers all settings and strategies
         every = product(self.seeds, chosen, self.strategies or STRATEGIES)
         trials = [Trial(setting, strategy, seed) for seed, setting, strategy in every]
-        size, scenes_dir = TrainingSize(), self.scenes_dir and self.scenes_dir.resolve()
-        return Experiment("stability", size, lambda _: trials, run_trial, lambda _: (size, scenes_dir))
+        size = TrainingSize()
+
+        def arguments(trial: Trial) -> tuple[object, ...]:
+            return size, folders.get(SETTINGS[trial.setting].scene or "")
+
+        return Experiment("stability", size, lambda _: trials, run_trial, arguments)

@@ -40,8 +40,8 @@ class TrainingSize:
     """Coarse ones, and as many importance samples."""
 
 
-def run_trial(trial: Trial, size: TrainingSize, scenes_dir: Path | None = None) -> dict[str, Any]:
-    """Train once; called in a process of its own. scenes_dir: of the real scenes.
+def run_trial(trial: Trial, size: TrainingSize, scene: Path | None = None) -> dict[str, Any]:
+    """Train once; called in a process of its own. scene: folder of a setting's real scene.
 
     Returns:
         outcome and failure_mode; what `measure_views` measures; which networks were dead_at_start; how many were
@@ -52,7 +52,7 @@ def run_trial(trial: Trial, size: TrainingSize, scenes_dir: Path | None = None) 
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         trainer, pictures = build_trainer(
-            SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder), scenes_dir
+            SETTINGS[trial.setting], trial.strategy, trial.seed, size, Path(folder), scene
         )
         model = trainer.pipeline.model
         dead = dead_networks(model, [picture.rays(model.device)[::2] for picture in pictures])
@@ -80,10 +80,10 @@ def failure_mode(outcome: Outcome, accumulation: float, dead_at_start: bool) -> 
 
 
 def build_trainer(
-    setting: Setting, strategy: str, seed: int, size: TrainingSize, folder: Path, scenes_dir: Path | None = None
+    setting: Setting, strategy: str, seed: int, size: TrainingSize, folder: Path, scene: Path | None = None
 ) -> tuple[Trainer, list[Picture]]:
     """A training that is ready to begin, its run in a folder, and its held-out views."""
-    train, test = _read_splits(setting, scenes_dir)
+    train, test = _read_splits(setting, scene)
     changes = {
         "output_dir": folder,
         "experiment_name": "stability",
@@ -111,12 +111,11 @@ def build_trainer(
     return config.setup(run=RunFolder.create(config), pipeline=pipeline, preview=None), to_pictures(test)
 
 
-def _read_splits(setting: Setting, scenes_dir: Path | None) -> tuple[Views, Views]:
+def _read_splits(setting: Setting, scene: Path | None) -> tuple[Views, Views]:
     """Training and held-out views."""
     shifted = setting.placement == "shifted"
-    if setting.scene is not None:
-        assert scenes_dir is not None  # the command insists on it
-        return read_real_splits(scenes_dir / setting.scene, setting.foreground, shifted, setting.num_views)
+    if scene is not None:
+        return read_real_splits(scene, setting.foreground, shifted, setting.num_views)
     assert setting.foreground is not None  # of real scenes alone
     train, test = render_splits(setting.foreground, shifted, NUM_TRAIN)
     return train.subset(range(setting.num_views)), test

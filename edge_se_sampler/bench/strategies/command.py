@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.command import ExperimentCommand, find_scene
 from edge_se_sampler.bench.runner import Experiment
-from edge_se_sampler.errors import InputError, check_known, check_value
+from edge_se_sampler.errors import check_known, check_value
 
 if TYPE_CHECKING:
     from edge_se_sampler.bench.strategies.trials import Trial
@@ -40,15 +40,13 @@ class BenchStrategies(ExperimentCommand):
 
         check_known("strategies", self.strategies, STRATEGIES)
         check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
-        for scene in self.scenes:
-            if not (self.scenes_dir / scene).is_dir():
-                raise InputError(f"--scenes-dir {self.scenes_dir}: has no folder {scene}; give the scenes' folder")
-        settings, scenes_dir, workplace = Settings(), self.scenes_dir.resolve(), self.workplace.resolve()
+        folders = {scene: find_scene(self.scenes_dir, scene) for scene in self.scenes}
+        settings, workplace = Settings(), self.workplace.resolve()
         chosen = self.strategies or tuple(STRATEGIES)
         trials = list_trials(self.models, self.scenes, self.downscales, self.placements, self.plans, chosen, self.seeds)
 
         def arguments(trial: Trial) -> tuple[Settings, Path]:
-            scene = scenes_dir / trial.scene
+            scene = folders[trial.scene]
             return settings, scene if trial.placement == "centered" else offcenter_copies(scene, workplace) / "shifted"
 
         return Experiment("strategies", settings, lambda _: trials, run_trial, arguments)
