@@ -106,7 +106,7 @@ def describe_machine(machine: Mapping[str, Any]) -> str:
     """Hardware and versions in a line."""
     versions = ", ".join(f"{name} {machine[name]}" for name in ("python", "torch", "numpy"))
     counts = (f"{machine[key]} {key.removesuffix('s') if machine[key] == 1 else key}" for key in ("cores", "threads"))
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    gpu = f", {machine['gpu']}" if machine.get("gpu") else ""
     return f"{machine['processor']}, {', '.join(counts)}{gpu}; {versions}"
 
 
