@@ -67,11 +67,11 @@ def _sheet(of: Collection[str], runs: Runs, views: Path) -> Any:
     if not tables:
         return None
     seed = min(trial.seed for trial in runs)
-    width, height = max(0.62 * len(scenes) + 1.3, 3.2), 0.62 * (len(LABELS) + 1) + 0.6
+    width, height = max(0.62 * len(scenes) + 1.3, 2.7), 0.62 * (len(LABELS) + 1) + 0.6
     rows, columns = -(-len(tables) // 2), min(2, len(tables))
     figure = require_pyplot().figure(figsize=(width * columns, height * rows))
     parts = np.ravel(figure.subfigures(rows, columns, squeeze=False))
-    grid = {"left": 0.2, "right": 0.99, "bottom": 0.01, "top": 0.88, "wspace": 0.06, "hspace": 0.06}
+    grid = {"left": 1.13 / width, "right": 0.99, "bottom": 0.01, "top": 0.88, "wspace": 0.06, "hspace": 0.06}
     for part, number in zip(parts, tables, strict=False):
         part.suptitle(f"Table {number}: {TABLES[number].title}", fontsize=10)
         axes = part.subplots(len(LABELS) + 1, len(scenes), squeeze=False, gridspec_kw=grid)
