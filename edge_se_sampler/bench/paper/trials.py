@@ -103,6 +103,11 @@ class Trial:
         """Of its run folder and its rendering."""
         return f"table-{self.table}-{self.scene}-{self.strategy}-{self.seed}"
 
+    @property
+    def downscale(self) -> int:
+        """Every so many pixels of its scene's images, along both axes, become one."""
+        return REAL_DOWNSCALE if self.scene in REAL_SCENES else 1
+
 
 def runs_by_trial(runs: list[Run]) -> dict[Trial, Run]:
     return {Trial(run["table"], run["scene"], run["strategy"], run["seed"]): run for run in runs}
@@ -129,7 +134,7 @@ def build_config(trial: Trial, settings: Settings, data: Path, output_dir: Path)
     iterations = round(table.steps * (settings.info_iterations if table.method == "info-nerf" else settings.iterations))
     changes = {
         "data": data,
-        "downscale": REAL_DOWNSCALE if trial.scene in REAL_SCENES else 1,
+        "downscale": trial.downscale,
         "output_dir": output_dir,
         "experiment_name": trial.name,
         "max_num_iterations": iterations,
@@ -154,8 +159,7 @@ def run_trial(trial: Trial, settings: Settings, data: Path, workplace: Path) -> 
         path = views / f"{TABLES[trial.table].placement}-{trial.scene}-{split}.png"
         if not path.exists():
             views.mkdir(parents=True, exist_ok=True)
-            downscale = REAL_DOWNSCALE if trial.scene in REAL_SCENES else 1
-            write_image(path, unit_float(read_blender(data, split, LoadSettings(downscale=downscale)).images[0]))
+            write_image(path, unit_float(read_blender(data, split, LoadSettings(downscale=trial.downscale)).images[0]))
     return train_and_measure(build_config(trial, settings, data, workplace / "runs"), views / f"{trial.name}.png")
 
 
