@@ -242,6 +242,18 @@ def test_a_verdict_needs_more_than_the_spread_of_seeds(psnrs: tuple[float, ...],
     assert best_at_equal_seconds(runs, PANEL) == ("uniform" if verdict == "worse" else "edge")
 
 
+def test_a_single_pair_has_no_verdict_however_many_seeds_one_side_has() -> None:
+    runs = [run_of(25.0, 0), *(run_of(29 + seed / 10, seed, "edge") for seed in range(3))]
+    found = compare(runs, PANEL, "edge", "seconds")
+    assert found is not None
+    assert found.differences["psnr"] == pytest.approx(4)
+    assert found.verdict is None
+    runs += [run_of(25.0, seed, outcome="collapsed") for seed in (1, 2)]  # it lives where uniform pixels die
+    found = compare(runs, PANEL, "edge", "seconds")
+    assert found is not None
+    assert found.verdict == "better"
+
+
 def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
     runs = []
     for downscale, offsets in ((4, (2, 2)), (8, (-2, -2)), (16, (0, 0)), (2, (2,))):

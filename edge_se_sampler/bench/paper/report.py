@@ -11,7 +11,7 @@ from edge_se_sampler.bench.paper.figures import draw_figures
 from edge_se_sampler.bench.paper.published import LABELS, REAL_SCENES, SCENES, published
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, REAL_DOWNSCALE, TABLES
 from edge_se_sampler.bench.paper.verdicts import MIN_DIFFERENCE, ClaimVerdict, evaluate_claims
-from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
+from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.statistics import format_difference
 
@@ -62,6 +62,7 @@ def describe(folder: Path) -> str:
         comparisons="\n\n".join(map(_describe_claim, claims)),
         real_comparisons="\n\n".join(map(_describe_claim, real_claims)),
         tables="\n\n".join(tables),
+        notes=read_notes(folder),
         reproduce=describe_command(result),
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN
-from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table
+from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table, read_notes
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.stability.settings import REAL_SETTINGS, SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
@@ -39,6 +39,7 @@ def describe(folder: Path) -> str:
         settings=tabulate_settings(counts),
         real_seeds=len({run["seed"] for run in real_runs}) or "",
         real_settings=tabulate_settings(real_counts) if real_runs else "",
+        notes=read_notes(folder),
         reproduce=describe_command(result),
     )
 

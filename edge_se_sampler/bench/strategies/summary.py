@@ -45,11 +45,13 @@ class Comparison:
     """By metric, over the trainings that uniform pixels have too and that did not both fail; empty: none."""
     pairs: list[float]
     """Differences of PSNR, one a scene and seed."""
+    fewest_pairs: int
+    """Of a scene; 0: there is nothing to compare with."""
 
     @property
     def verdict(self) -> Verdict | None:
-        """Better or worse: by more than the spread. None: without a spread, or nothing to compare with."""
-        if self.spread is None or not self.differences:
+        """Better or worse: by more than the spread. None: without a spread, or with less than two pairs in a scene."""
+        if self.spread is None or self.fewest_pairs < 2:
             return None
         difference = self.differences["psnr"]
         if abs(difference) <= self.spread:
@@ -85,17 +87,19 @@ def compare(runs: list[Run], panel: Panel, strategy: str, plan: str) -> Comparis
     if not own:
         return None
     pairs = [pair for pair in _pair(own, uniform) if not all(map(failed, pair))]
-    differences, spreads = {}, [_spread(own)]
+    differences, spreads, fewest_pairs = {}, [_spread(own)], 0
     if pairs and strategy != UNIFORM:
         for metric in METRICS:
             by_scene = _by_scene((run["scene"], run[metric] - before[metric]) for run, before in pairs)
             differences[metric] = statistics.mean(map(statistics.median, by_scene.values()))
         spreads.append(_spread([before for _, before in pairs]))
+        fewest_pairs = min(map(len, _by_scene((run["scene"], run["psnr"]) for run, _ in pairs).values()))
     return Comparison(
         psnr=statistics.mean(map(statistics.median, _by_scene((run["scene"], run["psnr"]) for run in own).values())),
         spread=max((spread for spread in spreads if spread is not None), default=None),
         differences=differences,
         pairs=[run["psnr"] - before["psnr"] for run, before in pairs],
+        fewest_pairs=fewest_pairs,
     )
 
 
