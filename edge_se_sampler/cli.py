@@ -21,8 +21,8 @@ from edge_se_sampler.run_commands import Training
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; exit code 2 for bad input, 1 for a training that diverged or lost
-    one of its processes, 130 for Ctrl-C."""
+    """Run a command; exit code 2 for bad input, 1 for a training that diverged or lost one of its processes, and for an
+    experiment of which a training failed, 130 for Ctrl-C."""
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch's, before it is imported: large pages for large tensors
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed, as by >&-

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 import pytest
 
 from edge_se_sampler.bench import runner
+from edge_se_sampler.bench.command import ExperimentCommand
 from edge_se_sampler.bench.runner import (
     VERSION,
     Experiment,
@@ -127,6 +129,31 @@ def test_a_failing_trial_is_reported_stops_no_other_and_is_tried_again(
     again = run_experiment(toy_experiment(fail_once), tmp_path, one_thread)
     assert [run["seed"] for run in again["runs"]] == [0, 1, 2]
     assert again["errors"] == []
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToyCommand(ExperimentCommand):
+    failing: int | None
+
+    def experiment(self) -> Experiment:
+        def fail(trial: ToyTrial) -> Run:
+            if trial.seed == self.failing:
+                raise FloatingPointError("the loss is not finite")
+            return train(trial)
+
+        return toy_experiment(fail)
+
+
+@pytest.mark.parametrize("failing", [None, 0])
+def test_an_experiment_of_which_a_training_failed_ends_with_exit_code_1(
+    failing: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("edge_se_sampler.bench.command.executor_factory", lambda *_: one_thread)
+    command = ToyCommand(output_dir=tmp_path, shard="1/2", failing=failing)
+    with nullcontext() if failing is None else pytest.raises(SystemExit) as ended:
+        command.run()
+    assert ended is None or ended.value.code == 1
+    assert ("1 failed" in capsys.readouterr().err) == (failing is not None)
 
 
 EMPTY = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +53,8 @@ class ExperimentCommand(ABC):
         """What is trained; InputError if a flag's value has no meaning."""
 
     def run(self) -> None:
-        """Train and report; InputError as `experiment`, `run_experiment` and `write_report`."""
+        """Train and report; InputError as `experiment`, `run_experiment` and `write_report`; exit code 1 if a training
+        ended in an error."""
         check_value("seeds", "empty", bool(self.seeds), "at least one number")
         check_value("workers", self.workers, self.workers is None or self.workers > 0, "at least 1")
         experiment, shard = self.experiment(), Shard.parse(self.shard)
@@ -68,6 +70,9 @@ class ExperimentCommand(ABC):
             write_report(self.output_dir, workplace=self.workplace)
             page = self.output_dir / "README.md"
         print(f"{len(result['runs'])} trainings; see {page}")
+        if failed := len(result["errors"]):
+            print(f"edge-se: {failed} failed, as said above; the same command tries them again", file=sys.stderr)
+            sys.exit(1)
 
     def default_workers(self) -> int:
         """How many trainings at once if --workers is left out: as many as CPUs that this process may use; a GPU is one
