@@ -49,20 +49,20 @@ def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deep
     """
     row, column = np.indices(level.shape)
     shift = MAX_LEVEL - level.astype(np.int64)
-    leaf = (row >> shift << shift) * SIDE + (column >> shift << shift)  # of a cell, by the leaf's first
-    # (SIDE, H) and (SIDE, W): 1 where a row or column of pixels lies in one of cells
-    rows, columns = ((np.arange(SIDE)[:, None] == cell_of(np.arange(n), n)).astype(np.float64) for n in change.shape)
+    first_cell = (row >> shift << shift) * SIDE + (column >> shift << shift)  # of the leaf that a cell lies in
+    rows, columns = (cell_of(np.arange(length), length) for length in change.shape)
+    leaf = first_cell[rows[:, None], columns]  # of a pixel
 
     def by_leaf(values: np.ndarray) -> np.ndarray:
-        """For each cell the sum over the pixels of its leaf."""
-        return np.bincount(leaf.reshape(-1), (rows @ values @ columns.T).reshape(-1), SIDE * SIDE)[leaf]
+        """Sums over the pixels of each leaf, (SIDE * SIDE,) by its first cell."""
+        return np.bincount(leaf.reshape(-1), values.reshape(-1), SIDE * SIDE)
 
     floor = CHANGE_FLOOR * change.mean(dtype=np.float64) / CHANGE_STEP
     c = np.maximum(change / CHANGE_STEP, np.ceil(max(floor, 1))).astype(np.float64)  # whole numbers: sums are exact
     pixels, total = by_leaf(valid), by_leaf(c * valid)
-    weight = np.where(level == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
+    weight = np.where(level.reshape(-1) == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
     uniform, by_change = (weight / 2 / np.where(pixels > 0, amount, 1) for amount in (pixels, total))
-    strength = rows.T @ uniform @ columns + rows.T @ by_change @ columns * c
+    strength = uniform[leaf] + by_change[leaf] * c
     return (strength * valid).astype(np.float32)
 
 
