@@ -23,18 +23,17 @@ from edge_se_sampler.bench.strategies.summary import (
     cost_of_a_step,
     count_failures,
 )
+from edge_se_sampler.bench.strategies.train import build_config, run_trial, without_alpha
 from edge_se_sampler.bench.strategies.trials import (
     MODELS,
+    NERFACTO,
     PLANS,
     STRATEGIES,
     Length,
     PlanName,
     Settings,
     Trial,
-    build_config,
     read_views,
-    run_trial,
-    without_alpha,
 )
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MANAGER, MODEL
@@ -55,7 +54,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("model", "strategy"), [(m, name) for name, s in STRATEGIES.items() for m in s.models if m != "lean-no-masks"]
+    ("model", "strategy"), [(m, name) for name, s in STRATEGIES.items() for m in s.models if m in ("nerf", "lean")]
 )
 def test_every_strategy_can_be_trained_under_both_plans(model: str, strategy: str, scene: Path, tmp_path: Path) -> None:
     for plan in ("seconds", "steps"):
@@ -124,6 +123,22 @@ def test_what_is_compared_is_trained_side_by_side(tmp_path: Path) -> None:
     assert trials[:2] == [first, replace(first, strategy="hard-samples")]
     assert len(trials) == 3 * 2 * 2 * 2 * (2 + 1)  # hard samples are of NeRF alone
     assert experiment.arguments(first) == (Settings(), tmp_path / "lego")
+
+
+def test_nerfacto_is_trained_on_small_copies_by_what_needs_no_weights(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags: Any = {"output_dir": tmp_path, "scenes_dir": scene.parent, "scenes": ("bricks",), "models": (NERFACTO,)}
+    command = BenchStrategies(**flags, workplace=tmp_path, placements=("centered",), downscales=(2,), plans=("steps",))
+    monkeypatch.setattr("edge_se_sampler.bench.nerfstudio.host.find_spec", lambda _: None)
+    with pytest.raises(InputError, match="nerfstudio"):
+        command.experiment()
+    monkeypatch.setattr("edge_se_sampler.bench.nerfstudio.host.find_spec", lambda _: True)
+    experiment = command.experiment()
+    trials = experiment.trials([])
+    assert {t.strategy for t in trials} == STRATEGIES.keys() - {"expansive", "se-coarse", "hard-samples"}
+    _, data = experiment.arguments(trials[0])
+    assert read_views(data, 1, "test").images[0].shape[:2] == (12, 12)
 
 
 def test_an_off_center_copy_is_made_once(scene: Path, tmp_path: Path) -> None:
@@ -265,6 +280,22 @@ def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
     less = [run for run in runs if run["downscale"] >= 8]
     assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable in 1 of 2"
     assert describe_use(less, "se") == "–"
+
+
+def test_a_capture_counts_where_it_has_a_number(tmp_path: Path) -> None:
+    def both(strategy: str, psnr: float) -> list[dict[str, Any]]:
+        fox = {"scene": "fox", "foreground_psnr": None}
+        return [run_of(psnr, 0, strategy), run_of(psnr - 1, 0, strategy, **fox)]
+
+    runs = [*both("uniform", 20.0), *both("edge", 23.0)]
+    found = compare(runs, PANEL, "edge", "seconds")
+    assert found is not None
+    assert found.differences == dict.fromkeys(("psnr", "foreground_psnr", "edge_band_psnr"), 3.0)
+    runs = [run for run in runs if run["scene"] == "fox"]
+    found = compare(runs, PANEL, "edge", "seconds")
+    assert found is not None
+    assert found.differences == {"psnr": 3.0, "edge_band_psnr": 3.0}
+    assert "| edge | 22.00 | +3.00 | – | +3.00 |" in describe(folder_of(tmp_path, runs))
 
 
 def test_uniform_pixels_are_compared_with_nothing() -> None:

@@ -193,11 +193,14 @@ def _nerfstudio(method: str, clock: Clock, data: Path, folder: Path, seed: int, 
     """A method of nerfstudio's as ns-train has it."""
     from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views
+    from edge_se_sampler.bench.nerfstudio.host import (
+        build_config,
+        build_trainer,
+        render_test_views,
+        skip_lpips_weights,
+    )
 
-    # only its own evaluation, which is not called, has a use for LPIPS, whose weights it would download
-    metrics: Any = importlib.import_module("torchmetrics.image.lpip")
-    metrics.LearnedPerceptualImagePatchSimilarity = torch.nn.Identity
+    skip_lpips_weights()
     config = build_config(method, seed, data, folder, flags)
     clock.start()
     trainer = build_trainer(config, "test")

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from edge_se_sampler.bench.command import ExperimentCommand
 from edge_se_sampler.bench.runner import Experiment
-from edge_se_sampler.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,13 +18,12 @@ class BenchNerfstudio(ExperimentCommand):
 
     def experiment(self) -> Experiment:
         from importlib.metadata import version
-        from importlib.util import find_spec
 
+        from edge_se_sampler.bench.nerfstudio.host import require_nerfstudio
         from edge_se_sampler.bench.nerfstudio.train import METHODS, SCENE_OPTIONS, TrainingSettings, Trial, run_trial
         from edge_se_sampler.bench.train import cached_scene
 
-        if find_spec("nerfstudio") is None or find_spec("torchvision") is None:
-            raise InputError("bench nerfstudio needs all of nerfstudio 1.1.5 beside edge_se_sampler in one environment")
+        require_nerfstudio("bench nerfstudio")
         settings = TrainingSettings(nerfstudio=version("nerfstudio"))
         trials = [Trial(method, seed) for seed in self.seeds for method in METHODS]
 

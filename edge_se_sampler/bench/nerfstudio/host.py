@@ -5,12 +5,28 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import random
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from edge_se_sampler.errors import InputError
+
+
+def require_nerfstudio(what: str) -> None:
+    """InputError, which names what needs it, if nerfstudio is not there as a whole."""
+    if find_spec("nerfstudio") is None or find_spec("torchvision") is None:
+        raise InputError(f"{what} needs all of nerfstudio 1.1.5 beside edge_se_sampler in one environment")
+
+
+def skip_lpips_weights() -> None:
+    """Build models without LPIPS, whose weights would be downloaded; only nerfstudio's own evaluation measures it."""
+    metrics: Any = importlib.import_module("torchmetrics.image.lpip")
+    metrics.LearnedPerceptualImagePatchSimilarity = torch.nn.Identity
 
 
 def build_config(method: str, seed: int, data: Path, runs: Path, flags: Sequence[str] = ()) -> Any:
@@ -41,11 +57,12 @@ def build_trainer(config: Any, test_mode: str) -> Any:
     return trainer
 
 
-def render_test_views(trainer: Any) -> list[Any]:
-    """The test views as nerfstudio renders them now, (H, W, 3) each."""
+def render_test_views(trainer: Any, numbers: Sequence[int] | None = None) -> list[Any]:
+    """The test views, or those of some numbers, as nerfstudio renders them now, (H, W, 3) each."""
     pipeline = trainer.pipeline
     pipeline.eval()
     cameras = pipeline.datamanager.eval_dataset.cameras.to(pipeline.device)
-    outputs = [pipeline.model.get_outputs_for_camera(cameras[i : i + 1]) for i in range(len(cameras))]
+    chosen = range(len(cameras)) if numbers is None else numbers
+    outputs = [pipeline.model.get_outputs_for_camera(cameras[i : i + 1]) for i in chosen]
     pipeline.train()
     return [output["rgb_fine" if "rgb_fine" in output else "rgb"].cpu().numpy() for output in outputs]

@@ -16,13 +16,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchStrategies(ExperimentCommand):
-    """Compare every way of choosing pixels with uniform pixels: real scenes, equal steps and equal CPU seconds, NeRF
-    and lean-nerf with and without masks. Resumes."""
+    """Compare every way of choosing pixels with uniform pixels: real scenes, equal steps and equal CPU seconds; NeRF,
+    lean-nerf with and without masks, and nerfstudio's nerfacto. Resumes."""
 
     scenes_dir: Path
-    """Folder of Blender scenes, such as NeRF-synthetic's (lego, chair, ...) with their official splits."""
-    models: tuple[Literal["nerf", "lean", "lean-no-masks"], ...] = ("nerf", "lean", "lean-no-masks")
-    """NeRF of size tiny; lean-nerf; and lean-nerf on images without alpha."""
+    """Folder of Blender scenes, such as NeRF-synthetic's (lego, chair, ...) with their official splits; for nerfacto
+    captures, too."""
+    models: tuple[Literal["nerf", "lean", "lean-no-masks", "nerfacto"], ...] = ("nerf", "lean", "lean-no-masks")
+    """NeRF of size tiny; lean-nerf; lean-nerf on images without alpha; a small nerfacto, which needs all of nerfstudio
+    1.1.5 in the same environment."""
     scenes: tuple[str, ...] = ("lego", "chair")
     """Folders in it."""
     downscales: tuple[int, ...] = (8, 4)
@@ -30,16 +32,21 @@ class BenchStrategies(ExperimentCommand):
     placements: tuple[Literal["centered", "shifted"], ...] = ("centered", "shifted")
     """The scene as it is, or its copy by `edge-se offcenter`."""
     plans: tuple[Literal["seconds", "steps"], ...] = ("seconds", "steps")
-    """Equal CPU seconds (NeRF 60, lean-nerf 10) or equal steps (NeRF 300, lean-nerf 800)."""
+    """Equal CPU seconds (NeRF and nerfacto 60, lean-nerf 10) or equal steps (300, 800)."""
     strategies: tuple[str, ...] = ()
     """Ways of choosing pixels; none: all. --dry-run lists their names."""
 
     def experiment(self) -> Experiment:
-        from edge_se_sampler.bench.strategies.trials import STRATEGIES, Settings, list_trials, run_trial
+        from edge_se_sampler.bench.baselines.folders import copied_scene
+        from edge_se_sampler.bench.nerfstudio.host import require_nerfstudio
+        from edge_se_sampler.bench.strategies.train import run_trial
+        from edge_se_sampler.bench.strategies.trials import NERFACTO, STRATEGIES, Settings, list_trials
         from edge_se_sampler.bench.train import offcenter_copies
 
         check_known("strategies", self.strategies, STRATEGIES)
         check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
+        if NERFACTO in self.models:
+            require_nerfstudio("--models nerfacto")
         folders = {scene: find_scene(self.scenes_dir, scene) for scene in self.scenes}
         settings, workplace = Settings(), self.workplace.resolve()
         chosen = self.strategies or tuple(STRATEGIES)
@@ -47,6 +54,7 @@ class BenchStrategies(ExperimentCommand):
 
         def arguments(trial: Trial) -> tuple[Settings, Path]:
             scene = folders[trial.scene]
-            return settings, scene if trial.placement == "centered" else offcenter_copies(scene, workplace) / "shifted"
+            data = scene if trial.placement == "centered" else offcenter_copies(scene, workplace) / "shifted"
+            return settings, copied_scene(workplace, data, trial.downscale) if trial.model == NERFACTO else data
 
         return Experiment("strategies", settings, lambda _: trials, run_trial, arguments)

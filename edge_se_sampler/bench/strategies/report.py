@@ -169,7 +169,8 @@ def _show(comparison: Comparison | None) -> list[str]:
     if comparison is None:
         return ["–"] * (1 + len(METRICS))
     spread = "" if comparison.spread is None else f" ({decimals(comparison.spread)})"
-    texts = [_signed(comparison.differences[m]) if comparison.differences else "–" for m in METRICS]
+    found = comparison.differences
+    texts = [_signed(found[metric]) if metric in found else "–" for metric in METRICS]
     if comparison.verdict in ("better", "worse"):
         texts[0] = f"**{texts[0]}**"
     return [decimals(comparison.psnr) + spread, *texts]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.runner import Run
-from edge_se_sampler.bench.strategies.trials import MODELS, PLACEMENTS, STRATEGIES, UNIFORM
+from edge_se_sampler.bench.strategies.trials import ALL_MODELS, PLACEMENTS, STRATEGIES, UNIFORM
 
 Verdict = Literal["better", "same", "worse"]
 METRICS = ("psnr", "foreground_psnr", "edge_band_psnr")
@@ -42,7 +42,8 @@ class Comparison:
     spread: float | None
     """The greater of its own and of uniform's that is known; None: neither, see `_spread`."""
     differences: dict[str, float]
-    """By metric, over the trainings that uniform pixels have too and that did not both fail; empty: none."""
+    """By metric, over the trainings that uniform pixels have too and that did not both fail; empty: none. Captures have
+    no PSNR of an object."""
     pairs: list[float]
     """Differences of PSNR, one a scene and seed."""
     fewest_pairs: int
@@ -60,10 +61,10 @@ class Comparison:
 
 
 def panels_of(runs: Iterable[Run]) -> list[Panel]:
-    """Models in the order of `MODELS`, small before large, centered before shifted."""
+    """Models in the order of `ALL_MODELS`, small before large, centered before shifted."""
 
     def order(panel: Panel) -> tuple[Any, ...]:
-        return [*MODELS].index(panel.model), -panel.downscale, PLACEMENTS.index(panel.placement)
+        return ALL_MODELS.index(panel.model), -panel.downscale, PLACEMENTS.index(panel.placement)
 
     return sorted({Panel.of(run) for run in runs}, key=order)
 
@@ -90,8 +91,10 @@ def compare(runs: list[Run], panel: Panel, strategy: str, plan: str) -> Comparis
     differences, spreads, fewest_pairs = {}, [_spread(own)], 0
     if pairs and strategy != UNIFORM:
         for metric in METRICS:
-            by_scene = _by_scene((run["scene"], run[metric] - before[metric]) for run, before in pairs)
-            differences[metric] = statistics.mean(map(statistics.median, by_scene.values()))
+            known = [(run, before) for run, before in pairs if None not in (run[metric], before[metric])]
+            by_scene = _by_scene((run["scene"], run[metric] - before[metric]) for run, before in known)
+            if by_scene:
+                differences[metric] = statistics.mean(map(statistics.median, by_scene.values()))
         spreads.append(_spread([before for _, before in pairs]))
         fewest_pairs = min(map(len, _by_scene((run["scene"], run["psnr"]) for run, _ in pairs).values()))
     return Comparison(
