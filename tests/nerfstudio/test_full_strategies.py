@@ -28,7 +28,7 @@ from edge_se_sampler.bench.strategies.trials import (  # noqa: E402
     Trial,
 )
 
-SHORT = Settings(nerf=Length(1.5, 12, 2))
+SHORT = Settings(nerf=Length(1.5, 4, 2))
 TRIAL = Trial(NERFACTO, "mic", 1, "centered", "steps", "edge", 3)
 
 
@@ -36,10 +36,10 @@ TRIAL = Trial(NERFACTO, "mic", 1, "centered", "steps", "edge", 3)
 def test_a_training_lasts_as_long_as_its_plan(plan: PlanName, host_scene: Path) -> None:
     run = run_trial(replace(TRIAL, plan=plan), SHORT, host_scene)
     if plan == "steps":
-        assert run["steps"] == 12
+        assert run["steps"] == 4
     else:
         assert run["seconds"] == pytest.approx(1.5, abs=0.5)
-        assert run["steps"] > 12
+        assert run["steps"] > 4
     assert 0 < run["ready_seconds"] < run["seconds"] < run["cpu_seconds"]
     assert run["size"] == [32, 32]
     assert len({run[name] for name in ("psnr", "foreground_psnr", "edge_band_psnr")}) == 3
@@ -62,7 +62,7 @@ def test_every_strategy_of_nerfacto_draws_its_pixels(
     run = run_trial(replace(TRIAL, strategy=strategy), SHORT, host_scene)
     expected = {"early": "uniform", "late": "uniform", **STRATEGIES[strategy].settings}
     assert seen == [(expected["early"], expected["late"], 1)]
-    assert run["steps"] == 12
+    assert run["steps"] == 4
 
 
 def test_a_capture_is_measured_beside_its_mean_color(tmp_path: Path) -> None:

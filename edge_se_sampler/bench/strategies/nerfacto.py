@@ -96,7 +96,7 @@ def nerfacto_config(trial: Trial, settings: Settings, data: Path, folder: Path, 
     config = build_config("edge-se-nerfacto", trial.seed, data, folder, arguments)
     config.max_num_iterations = settings.nerf.steps if trial.plan == "steps" else NEVER
     config.steps_per_save = NEVER
-    config.mixed_precision = False
+    config.vis, config.logging.local_writer.enable = "none", False  # writers outlive a training, and its folder
     for name, value in sampler_settings(trial.strategy, settings.nerf).items():
         setattr(config.pipeline.datamanager.pixel_sampler, name, value)
     return config
