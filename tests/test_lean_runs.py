@@ -215,7 +215,7 @@ def test_inspect_tells_what_was_derived(larger: Path, tmp_path: Path, edge_se: A
     analysis = analyze_views(read_blender(larger, "train"), LeanModelConfig())
     assert f"{analysis.hull.cells.sum():,} of" in findings["cells"]
     assert findings["cells"].startswith(f"{analysis.hull.cell_size:.4f} a side, 4.0 pixels")
-    assert findings["levels"].startswith("what training sees is subdivided 2 times, to about 1 pixels")
+    assert findings["levels"].startswith("what training sees is subdivided 2 times, to about 1 pixel, ")
     assert findings["silhouettes"].startswith("6 of 6 views")
     assert findings["pixel"].startswith(f"{analysis.box.pixel_footprint:.4f}")
     assert findings["rays"].startswith(f"{100 * np.mean(analysis.hit_pixels):.1f} %")

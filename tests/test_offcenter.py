@@ -296,7 +296,7 @@ class TestClipping:
         offcenter(tmp_path / "scene", tmp_path / "out", SHIFT, (0, 0))
         picture[0, 0, 3] = 1
         iio.imwrite(tmp_path / "scene/train/r_0.png", picture)
-        assert "would lose 1 pixels" in refusal(tmp_path / "scene", tmp_path / "out2", shift=SHIFT, pad=(0, 0))
+        assert "would lose 1 pixel of" in refusal(tmp_path / "scene", tmp_path / "out2", shift=SHIFT, pad=(0, 0))
 
 
 class TestOut:

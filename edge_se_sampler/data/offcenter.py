@@ -165,7 +165,7 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
     if cut_off:
         frame, count = cut_off[0]
         more = f" ({len(cut_off)} views would lose some)" if cut_off[1:] else ""
-        problem = f"would lose {count} pixels of its object past the edge of the canvas{more}"
+        problem = f"would lose {count} pixel{'' if count == 1 else 's'} of its object past the edge of the canvas{more}"
         raise _image_error(frame, problem, f"give at least --pad {needed[0]:g} {needed[1]:g}, or no --pad")
     return plan
 

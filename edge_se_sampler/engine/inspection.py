@@ -81,7 +81,7 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         "cells": f"{hull.cell_size:.4f} a side, {hull.cell_size / footprint:.1f} pixels; {num_occupied:,} of "
         f"{num_cells:,.0f} may hold something ({100 * num_occupied / num_cells:.1f} %)",
         "levels": f"what training sees is subdivided {analysis.max_level} times, to about {config.voxel_size_px:g} "
-        f"pixel{'s' * (config.voxel_size_px != 1)}, as what was seen and {config.max_memory:.1f} GiB allow",
+        f"pixel{'' if config.voxel_size_px == 1 else 's'}, as what was seen and {config.max_memory:.1f} GiB allow",
         "corners": f"{config.max_memory * 2**30 / BYTES_PER_ROW / 1e6:.1f} million of cells fit into that; the images "
         f"show enough to learn {ROWS_PER_PIXEL * analysis.num_pixels / 1e6:.1f} million",
         "training": f"{preset.rays} rays a step, {preset.iterations:,} steps: size {config.size}, by the images' "
