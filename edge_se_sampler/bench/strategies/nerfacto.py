@@ -1,16 +1,16 @@
 """nerfacto inside nerfstudio on one thread of a CPU, its pixels chosen by a strategy: by the data manager of
-edge-se-nerfacto, nothing else changed. Its settings are much smaller than its own, which a GPU needs."""
+edge-se-nerfacto, nothing else changed. It is much smaller than by nerfstudio's settings, which are
+made for a GPU."""
 # pyright: reportMissingImports=false
 # nerfstudio's pins rule out the environment that is linted
 
 from __future__ import annotations
 
-import contextlib
 import io
 import tempfile
 import time
 import warnings
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +122,7 @@ def _train(trainer: Any, seconds: float | None) -> dict[str, Any]:
         TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], begin_step),
         TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], end_step),
     ]
-    with contextlib.suppress(TimeIsUp):
+    with suppress(TimeIsUp):
         trainer.train()
     return {
         "steps": steps,
