@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_se_sampler.models.voxel_kernels.simd import load, minimum, prefetch, splat, store, total, where_positive
+from edge_se_sampler.models.voxel_kernels.simd import (
+    load,
+    minimum,
+    prefetch,
+    sigmoid,
+    splat,
+    store,
+    total,
+    where_positive,
+)
 
 
 @njit
@@ -72,3 +81,25 @@ def test_a_vector_is_sixteen_numbers(function: Any) -> None:
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(out[:16], expected, rtol=2e-5, atol=1e-6)
     assert (out[16:] == 0).all()  # nothing beside it is written to
+
+
+@njit
+def activate(array: Any, out: Any) -> None:
+    for i in range(0, len(array), 16):
+        store(out, i, sigmoid(load(array, i)))
+
+
+def test_sigmoids_are_numpys() -> None:
+    values = np.concatenate((np.linspace(-86, 86, 16001), np.linspace(-2, 2, 15999))).astype(np.float32)
+    out = np.zeros_like(values)
+    activate(values, out)
+    np.testing.assert_allclose(out, 1 / (1 + np.exp(-values.astype(np.float64))), rtol=4e-7)
+
+
+def test_sigmoids_of_what_is_hardly_a_number() -> None:
+    infinity = np.float32(np.inf)
+    values = np.array([-infinity, -1e30, -87, 0, 87, 1e30, infinity, np.nan] * 2, np.float32)
+    out = np.zeros_like(values)
+    activate(values, out)
+    least = 1 / (1 + np.exp(87.0))
+    np.testing.assert_allclose(out, [least, least, least, 0.5, 1, 1, 1, np.nan] * 2, rtol=1e-6)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edge_se_sampler.models.voxel_kernels.simd import LANES
+
 CHUNK = 64
 """Rays that are rendered one after the other, in a slot of their own."""
 FEATURES, HARMONICS, WIDTH = 16, 16, 64
@@ -26,7 +28,7 @@ class Buffers(NamedTuple):
     color_index: np.ndarray  # (S, M) int32: row of what follows; -1: without a color
     features: np.ndarray  # (S, FEATURES M); in the backward pass they become their gradient
     hidden: np.ndarray  # (S, WIDTH M); in the backward pass it becomes its gradient
-    color: np.ndarray  # (S, 3 M); in the backward pass it becomes the gradient of the network's outputs
+    color: np.ndarray  # (S, 3 M + LANES); in the backward pass it becomes the gradient of the network's outputs
     color_weight: np.ndarray  # (S, M)
     color_cell: np.ndarray  # (S, M) int32: row of the sample's cell
     harmonics: np.ndarray  # (S, HARMONICS CHUNK)
@@ -50,7 +52,7 @@ class Buffers(NamedTuple):
             color_index=empty(samples, dtype=np.int32),
             features=empty(FEATURES * samples),
             hidden=empty(WIDTH * samples),
-            color=empty(3 * samples),
+            color=empty(3 * samples + LANES),
             color_weight=empty(samples),
             color_cell=empty(samples, dtype=np.int32),
             harmonics=empty(HARMONICS * CHUNK),

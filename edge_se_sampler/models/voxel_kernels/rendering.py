@@ -21,7 +21,8 @@ from edge_se_sampler.models.voxel_kernels.shading import (
     add_outer_products,
     add_sums,
     differentiate_features,
-    shade,
+    find_colors,
+    find_hidden,
     shade_backward,
     start_ray,
 )
@@ -29,6 +30,9 @@ from edge_se_sampler.models.voxel_kernels.simd import CONTRACT
 from edge_se_sampler.models.voxel_ops import Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid
 
+NUM_SUMS = 32
+"""Sums of the network's gradients that are kept apart: so many threads can work at them, and any number of threads
+comes to the same."""
 SAMPLES_PER_RAY = 16
 """Of a chunk, which there is room for at first."""
 f32 = np.float32
@@ -75,7 +79,7 @@ class _Render(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         accumulation, network, buffers = ctx.arrays
         d_rgb, d_accumulation = (gradient.contiguous().numpy() for gradient in gradients[:2])
-        of_network = network.zeros(len(buffers.ends))
+        of_network = network.zeros(min(len(buffers.ends), NUM_SUMS))
         transposed = network.hidden.reshape(FEATURES, WIDTH).T.ravel()
         _render_backward(d_rgb, d_accumulation, accumulation, network, transposed, buffers, of_network)
         of_rows = sum_row_gradients(buffers, ctx.num_rows)
@@ -131,8 +135,9 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
                 i, seen = first + ray, True
                 x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
                 start_ray(x, y, z, network, harmonics, view, ray)
-            shade(of_samples, network, view, ray, hidden, color, index)
+            find_hidden(of_samples, network.hidden, view, ray, hidden, index)
         start = end
+    find_colors(hidden, buffers.num_colored[slot], network.color, network.color_bias, color)
 
 
 @njit(cache=True, error_model="numpy", fastmath=CONTRACT)
@@ -170,11 +175,13 @@ def _collect_seen(buffers):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _render_backward(d_rgb, d_accumulation, accumulation, network, transposed, buffers, gradient):
-    """Gradients of the network, for each slot, and, in the buffers, of raw densities and features of samples."""
-    for slot in prange(len(buffers.ends)):
-        # functions of their own: numba would drop what is written to a tuple's arrays in a parallel loop
-        _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers)
-        _shade_chunk_backward(slot, network, transposed, buffers, gradient)
+    """Gradients of the network, in several sums, and, in the buffers, of raw densities and features of samples."""
+    num_sums = len(gradient.color_bias)
+    for number in prange(num_sums):
+        for slot in range(number, len(buffers.ends), num_sums):
+            # functions of their own: numba would drop what is written to a tuple's arrays in a parallel loop
+            _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers)
+            _shade_chunk_backward(slot, number, network, transposed, buffers, gradient)
 
 
 @njit(cache=True, error_model="numpy", fastmath=CONTRACT)
@@ -199,7 +206,7 @@ def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers
 
 
 @njit(cache=True, error_model="numpy")
-def _shade_chunk_backward(slot, network, transposed, buffers, gradient):
+def _shade_chunk_backward(slot, number, network, transposed, buffers, gradient):
     start, color = 0, buffers.color[slot]
     features, harmonics = buffers.features[slot], buffers.harmonics[slot]
     hidden, view = buffers.hidden[slot], buffers.of_ray[slot]
@@ -216,14 +223,14 @@ def _shade_chunk_backward(slot, network, transposed, buffers, gradient):
                 for h in range(HARMONICS):
                     harmonics[HARMONICS * rays + h] = harmonics[HARMONICS * ray + h]
             red, green, blue = color[3 * index], color[3 * index + 1], color[3 * index + 2]
-            gradient.color_bias[slot, 0] += red
-            gradient.color_bias[slot, 1] += green
-            gradient.color_bias[slot, 2] += blue
-            shade_backward(red, green, blue, hidden, view, rays, index, network.color, gradient.color[slot])
+            gradient.color_bias[number, 0] += red
+            gradient.color_bias[number, 1] += green
+            gradient.color_bias[number, 2] += blue
+            shade_backward(red, green, blue, hidden, view, rays, index, network.color, gradient.color[number])
         rays += seen
         start = buffers.ends[slot, ray]
     count = buffers.num_colored[slot]
-    add_outer_products(features, hidden, count, gradient.hidden[slot])
-    add_outer_products(harmonics, view, rays, gradient.harmonics[slot])
-    add_sums(view, rays, gradient.hidden_bias[slot])
+    add_outer_products(features, hidden, count, gradient.hidden[number])
+    add_outer_products(harmonics, view, rays, gradient.harmonics[number])
+    add_sums(view, rays, gradient.hidden_bias[number])
     differentiate_features(hidden, transposed, count, features)

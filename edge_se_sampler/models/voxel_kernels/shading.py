@@ -3,21 +3,20 @@
 # pyright: reportCallIssue=false
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from edge_se_sampler.models.voxel_kernels.buffers import FEATURES, HARMONICS, WIDTH
-from edge_se_sampler.models.voxel_kernels.simd import LANES, load, splat, store, total, where_positive
+from edge_se_sampler.models.voxel_kernels.simd import LANES, load, sigmoid, splat, store, total, where_positive
 from edge_se_sampler.models.voxel_ops import NetworkWeights
 
 f32 = np.float32
 
 
 class Network(NamedTuple):
-    """`NetworkWeights` or their gradients, flat; a gradient may have a row for each of several slots."""
+    """`NetworkWeights` or their gradients, flat; a gradient may have a row for each of several sums."""
 
     hidden: np.ndarray
     harmonics: np.ndarray
@@ -67,27 +66,35 @@ def spherical_harmonics(x, y, z, out, i):
 
 
 @njit(cache=True, error_model="numpy")
-def shade(features, network, view, ray, hidden, color, i):
-    """Color of the features of a sample, and its hidden layer."""
-    w1, first = network.hidden, WIDTH * i
+def find_hidden(features, weights, view, ray, hidden, i):
+    """The hidden layer of a sample, of its features and its ray's direction."""
     h0, h1 = load(view, WIDTH * ray), load(view, WIDTH * ray + 16)
     h2, h3 = load(view, WIDTH * ray + 32), load(view, WIDTH * ray + 48)
     for k in range(FEATURES):
         x = splat(features[FEATURES * i + k])
-        h0 += x * load(w1, WIDTH * k)
-        h1 += x * load(w1, WIDTH * k + 16)
-        h2 += x * load(w1, WIDTH * k + 32)
-        h3 += x * load(w1, WIDTH * k + 48)
-    h0, h1, h2, h3 = where_positive(h0, h0), where_positive(h1, h1), where_positive(h2, h2), where_positive(h3, h3)
-    store(hidden, first, h0)
-    store(hidden, first + 16, h1)
-    store(hidden, first + 32, h2)
-    store(hidden, first + 48, h3)
-    for channel in range(3):
-        w2 = WIDTH * channel
-        sums = h0 * load(network.color, w2) + h1 * load(network.color, w2 + 16)
-        sums += h2 * load(network.color, w2 + 32) + h3 * load(network.color, w2 + 48)
-        color[3 * i + channel] = f32(1) / (f32(1) + math.exp(-(total(sums) + network.color_bias[channel])))
+        h0 += x * load(weights, WIDTH * k)
+        h1 += x * load(weights, WIDTH * k + 16)
+        h2 += x * load(weights, WIDTH * k + 32)
+        h3 += x * load(weights, WIDTH * k + 48)
+    store(hidden, WIDTH * i, where_positive(h0, h0))
+    store(hidden, WIDTH * i + 16, where_positive(h1, h1))
+    store(hidden, WIDTH * i + 32, where_positive(h2, h2))
+    store(hidden, WIDTH * i + 48, where_positive(h3, h3))
+
+
+@njit(cache=True, error_model="numpy")
+def find_colors(hidden, count, weights, bias, color):
+    """The colors of `count` samples, of their hidden layers."""
+    for i in range(count):
+        h0, h1 = load(hidden, WIDTH * i), load(hidden, WIDTH * i + 16)
+        h2, h3 = load(hidden, WIDTH * i + 32), load(hidden, WIDTH * i + 48)
+        for channel in range(3):
+            row = WIDTH * channel
+            sums = h0 * load(weights, row) + h1 * load(weights, row + 16)
+            sums += h2 * load(weights, row + 32) + h3 * load(weights, row + 48)
+            color[3 * i + channel] = total(sums) + bias[channel]
+    for j in range(0, 3 * count, LANES):
+        store(color, j, sigmoid(load(color, j)))
 
 
 @njit(cache=True, error_model="numpy")

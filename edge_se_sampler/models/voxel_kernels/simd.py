@@ -7,6 +7,7 @@ Arrays are one-dimensional, contiguous and of float32, and are not checked for t
 # pyright: reportCallIssue=false, reportOptionalCall=false
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -140,3 +141,34 @@ def minimum(typing: Any, one: Any, other: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", *args), *args)
 
     return vector(vector, vector), generate
+
+
+@intrinsic
+def sigmoid(typing: Any, value: Any) -> Any:
+    """1 / (1 + exp(-value)) of each, to some units of the last place; of what is beyond 87 as of 87, on both sides."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        def constant(number: float) -> Any:
+            return ir.Constant(_VECTOR, [number] * LANES)
+
+        def multiply_add(one: Any, other: Any, more: Any) -> Any:
+            return builder.fadd(builder.fmul(one, other, ("contract",)), more, ("contract",))
+
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        floor = cgutils.get_or_insert_function(builder.module, kind, "llvm.floor.v16f32")
+        x = builder.fneg(args[0])
+        for bound, order in ((87.0, "<"), (-87.0, ">")):
+            x = builder.select(builder.fcmp_unordered(order, x, constant(bound)), x, constant(bound))  # NaN stays NaN
+        # exp(x) = 2^n exp(r) with |r| < 0.35: Taylor's polynomial is as exact as float32
+        n = builder.call(floor, [multiply_add(x, constant(1 / math.log(2)), constant(0.5))])
+        r = multiply_add(n, constant(-0.693359375), x)  # ln 2 in two parts, of which the first has few digits
+        r = multiply_add(n, constant(0.693359375 - math.log(2)), r)
+        exponential = constant(1 / math.factorial(6))
+        for k in range(5, -1, -1):
+            exponential = multiply_add(exponential, r, constant(1 / math.factorial(k)))
+        integers = ir.VectorType(_INT, LANES)
+        exponent = builder.add(builder.fptosi(n, integers), ir.Constant(integers, [127] * LANES))
+        power = builder.bitcast(builder.shl(exponent, ir.Constant(integers, [23] * LANES)), _VECTOR)
+        return builder.fdiv(constant(1.0), multiply_add(power, exponential, constant(1.0)))
+
+    return vector(vector), generate
