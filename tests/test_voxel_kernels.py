@@ -152,7 +152,9 @@ def gradients_of(ops: ModuleType) -> dict[str, torch.Tensor]:
     return dense | {name: value.detach() for name, value in vars(rendered).items()}
 
 
-def test_colors_and_gradients_are_the_reference_s() -> None:
+@pytest.mark.parametrize("num_sums", [2, 32])
+def test_colors_and_gradients_are_the_reference_s(num_sums: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "NUM_SUMS", num_sums)  # of five chunks of rays
     found, expected = gradients_of(voxel_kernels), gradients_of(voxel_ops)
     assert found.keys() == expected.keys()
     for name, value in expected.items():
