@@ -84,7 +84,7 @@ def find_hidden(features, weights, view, ray, hidden, i):
 
 @njit(cache=True, error_model="numpy")
 def find_colors(hidden, count, weights, bias, color):
-    """The colors of `count` samples, of their hidden layers."""
+    """The colors of `count` samples, of their hidden layers; up to fifteen numbers after them are written to."""
     for i in range(count):
         h0, h1 = load(hidden, WIDTH * i), load(hidden, WIDTH * i + 16)
         h2, h3 = load(hidden, WIDTH * i + 32), load(hidden, WIDTH * i + 48)

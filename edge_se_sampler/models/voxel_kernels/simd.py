@@ -21,6 +21,7 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global, signatur
 LANES = 16
 CONTRACT = {"contract"}
 """A product and a sum may be rounded together. No other freedom: what is compiled would depend on what is around it."""
+_FLAGS = tuple(CONTRACT)
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 
@@ -50,7 +51,7 @@ def _define_operator(function: Callable, instruction: str) -> None:
 
     @lower_builtin(function, vector, vector)
     def _(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, instruction)(*args, flags=tuple(CONTRACT))
+        return getattr(builder, instruction)(*args, flags=_FLAGS)
 
 
 _INSTRUCTIONS = {"add": "fadd", "iadd": "fadd", "sub": "fsub", "mul": "fmul"}
@@ -152,7 +153,7 @@ def sigmoid(typing: Any, value: Any) -> Any:
             return ir.Constant(_VECTOR, [number] * LANES)
 
         def multiply_add(one: Any, other: Any, more: Any) -> Any:
-            return builder.fadd(builder.fmul(one, other, ("contract",)), more, ("contract",))
+            return builder.fadd(builder.fmul(one, other, _FLAGS), more, _FLAGS)
 
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         floor = cgutils.get_or_insert_function(builder.module, kind, "llvm.floor.v16f32")
