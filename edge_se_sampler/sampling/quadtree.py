@@ -51,19 +51,40 @@ def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deep
     shift = MAX_LEVEL - level.astype(np.int64)
     first_cell = (row >> shift << shift) * SIDE + (column >> shift << shift)  # of the leaf that a cell lies in
     rows, columns = (cell_of(np.arange(length), length) for length in change.shape)
-    leaf = first_cell[rows[:, None], columns]  # of a pixel
 
     def by_leaf(values: np.ndarray) -> np.ndarray:
-        """Sums over the pixels of each leaf, (SIDE * SIDE,) by its first cell."""
-        return np.bincount(leaf.reshape(-1), values.reshape(-1), SIDE * SIDE)
+        """Sums over the pixels of the leaf that a cell lies in, (SIDE, SIDE)."""
+        sums = np.bincount(first_cell.reshape(-1), sum_by_cell(values, rows, columns).reshape(-1), SIDE * SIDE)
+        return sums[first_cell]
 
     floor = CHANGE_FLOOR * change.mean(dtype=np.float64) / CHANGE_STEP
-    c = np.maximum(change / CHANGE_STEP, np.ceil(max(floor, 1))).astype(np.float64)  # whole numbers: sums are exact
-    pixels, total = by_leaf(valid), by_leaf(c * valid)
-    weight = np.where(level.reshape(-1) == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
-    uniform, by_change = (weight / 2 / np.where(pixels > 0, amount, 1) for amount in (pixels, total))
-    strength = uniform[leaf] + by_change[leaf] * c
-    return (strength * valid).astype(np.float32)
+    c = np.maximum(change / CHANGE_STEP, np.float32(np.ceil(max(floor, 1))))  # whole numbers: sums are exact
+    c *= valid
+    pixels, total = by_leaf(valid), by_leaf(c)
+    weight = np.where(level == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
+    uniform, by_change = (
+        (weight / 2 / np.where(pixels > 0, amount, 1)).astype(np.float32)[:, columns][rows]
+        for amount in (pixels, total)
+    )  # of a pixel
+    c *= by_change
+    c += uniform
+    c *= valid
+    return c
+
+
+def sum_by_cell(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """(SIDE, SIDE) sums of values (H, W) over the pixels of each cell, in float64; of a small image some cells have no
+    pixel.
+
+    Args:
+        rows: (H,) row of cells that each row of pixels lies in, ascending.
+        columns: (W,) as rows.
+    """
+    first_row, first_column = (np.flatnonzero(np.diff(cells, prepend=-1)) for cells in (rows, columns))
+    sums = np.zeros((SIDE, SIDE))
+    by_row = np.add.reduceat(values, first_row, axis=0, dtype=np.float64)
+    sums[np.ix_(rows[first_row], columns[first_column])] = np.add.reduceat(by_row, first_column, axis=1)
+    return sums
 
 
 class Forest:
