@@ -48,6 +48,18 @@ def test_no_brick_is_stored_that_has_neither_a_cell_nor_a_corner() -> None:
     assert sorted(map(tuple, grid.bricks.tolist())) == [(4, 4, 4), (4, 4, 5)]
 
 
+def test_smaller_cells_and_a_state_keep_the_focus_which_earlier_versions_lack() -> None:
+    cells, focus = random_cells(), torch.tensor([1.0, 2.0, 3.0, 0.45, 9.0], dtype=torch.float64)
+    grid = BrickGrid.from_cells(torch.zeros(3), 0.5, cells, 2, focus=focus)
+    state = grid.state_dict()
+    for other in (grid.subdivide(cells, 0.25), BrickGrid.from_state(state)):
+        assert torch.equal(other.focus, focus)
+    del state["focus"]
+    before = BrickGrid.from_state(state)
+    before.load_state_dict(state)
+    assert before.focus.tolist() == [0] * 5
+
+
 def test_the_table_has_bricks_or_the_distance_to_the_next() -> None:
     cells = torch.zeros((80, 8, 8), dtype=torch.bool)
     cells[20, 0, 0] = True

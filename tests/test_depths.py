@@ -19,7 +19,7 @@ from edge_se_sampler.engine.pipeline import resolve_depths
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.occupancy.depths import find_depths
+from edge_se_sampler.occupancy.depths import NEAR_SHARE, find_depths
 from edge_se_sampler.occupancy.hull import find_focus
 
 
@@ -42,7 +42,7 @@ def opaque(views: Views) -> Views:
 def test_silhouettes_of_a_ball(scale: float) -> None:
     """The ball of radius 1, 4 away, in whatever units: nothing of it is cut off, and little is added."""
     found = find_depths(moved(ball_views(16, 64), scale, (5.0, -70.0, 2.0)))
-    assert found.source == "the silhouettes"
+    assert (found.source, found.near_share) == ("the silhouettes", 0)
     assert 2.4 < found.near / scale <= 3
     assert 5 <= found.far / scale < 5.6
 
@@ -67,12 +67,16 @@ def test_points_decide_but_for_stray_ones() -> None:
     assert found.source == "the points of the reconstruction"
     assert 2.6 < found.near <= 3
     assert 5 <= found.far < 5.6
+    assert found.near_share == NEAR_SHARE  # the surface begins at 3 of 4
+    close = find_depths(replace(views, points=(surface * 2.8,) * 12))
+    assert close.near_share == pytest.approx(0.9 * (4 - 2.8) / 4, rel=0.05)
 
 
 def test_cameras_alone() -> None:
     found = find_depths(opaque(moved(ball_views(12, 32), 10.0, (1.0, 2.0, 3.0))))
     assert (found.near, found.far) == pytest.approx((12, 80), rel=1e-3)
     assert "cameras" in found.source
+    assert found.near_share == NEAR_SHARE
 
 
 def test_a_single_camera_tells_nothing() -> None:
@@ -81,7 +85,8 @@ def test_a_single_camera_tells_nothing() -> None:
     with pytest.raises(InputError, match="give both near and far"):
         resolve_config(config, view)
     given = override(config, {"pipeline.model.near": 10.0, "pipeline.model.far": 60.0})
-    assert resolve_config(given, view).pipeline.model.depths == (10, 60)
+    model = resolve_config(given, view).pipeline.model
+    assert (model.depths, model.near_share) == ((10, 60), None)
 
 
 def test_focus() -> None:
@@ -104,10 +109,11 @@ def test_the_config_records_depths_and_flags_insist(tmp_path: Path) -> None:
     config = method_configs()["lean-nerf"]
     resolved = resolve_config(config, views)
     model = resolved.pipeline.model
-    assert (model.near, model.far) == (find_depths(views).near, find_depths(views).far)
+    found = find_depths(views)
+    assert (model.near, model.far, model.near_share) == (found.near, found.far, found.near_share)
     assert (resolved.data_format, resolved.eval_every) == ("colmap", 8)
     assert resolve_config(resolved, views) == resolved
     given = resolve_config(override(config, {"pipeline.model.near": 0.5}), views).pipeline.model
-    assert (given.near, given.far) == (0.5, model.far)
+    assert (given.near, given.far, given.near_share) == (0.5, model.far, None)
     _, source = resolve_depths(views, replace(config.pipeline.model, near=0.5))
     assert source == f"{find_depths(views).source} and the settings"

@@ -344,6 +344,19 @@ def test_a_part_that_is_off_does_not_carve() -> None:
     assert whole.num_silhouettes == 0
     assert carved.hull.cells.sum() * carved.hull.cell_size**3 < 0.02 * whole.hull.cells.sum() * whole.hull.cell_size**3
     assert analyze_views(views, NeRFModelConfig(empty_space_skipping=True)).num_silhouettes == VIEWS
+    assert carved.grid().carved
+    assert not whole.grid().carved
+
+
+def test_the_grid_knows_what_views_look_at_and_from_how_far() -> None:
+    views = views_of(rods())
+    analysis = analyze_views(views, LeanModelConfig(near_share=0.3))
+    *point, share, farthest = analysis.grid().focus.tolist()
+    np.testing.assert_allclose(point, analysis.box.center, atol=1e-9)
+    positions = views.cameras.camera_to_worlds[:, :, 3].numpy()
+    assert share == 0.3
+    assert farthest == pytest.approx(np.linalg.norm(positions - point, axis=1).max())
+    assert analyze_views(views, LeanModelConfig()).grid().focus[3] == 0
 
 
 @pytest.mark.parametrize("apart", [0, 60])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,13 @@ import torch
 from lean_models import VIEWS, config_of, full_model, steps_of
 from tiny import ball_views, tiny_rays, tiny_trainer
 
+from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.models import voxel_backend
+from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.lean import INITIAL_RAW_DENSITY, LeanModel
+from edge_se_sampler.occupancy.bricks import BrickGrid
 
 
 def test_a_training_that_sees_nothing_at_all_is_an_error() -> None:
@@ -30,15 +36,43 @@ def test_the_first_fog_is_sampled_however_many_cells_a_box_has(size: int) -> Non
     assert 0.2 < float(rendered.max()) < 0.99
 
 
+def opaque_views() -> Views:
+    views = ball_views()
+    return Views(views.names, tuple(image[..., :3].copy() for image in views.images), None, views.cameras)
+
+
 def test_without_masks_it_begins_with_a_thin_fog_in_all_of_the_box() -> None:
-    opaque = ball_views()
-    opaque = type(opaque)(opaque.names, tuple(image[..., :3].copy() for image in opaque.images), None, opaque.cameras)
-    trainer = tiny_trainer(config_of(50), opaque)
+    trainer = tiny_trainer(config_of(50), opaque_views())
     model = trainer.pipeline.model
     through = render_outputs(model, tiny_rays(100, dtype=torch.float32), ["accumulation_fine"])["accumulation_fine"]
     assert 0.3 < float(through.median()) < 0.8  # 1 - exp(-1) along the box
     losses = steps_of(trainer, 50)
     assert losses[-1] < losses[0]
+
+
+def test_the_fog_is_thin_in_whatever_part_of_a_box_that_no_masks_carved() -> None:
+    """A rig of cameras on one side sees half of it."""
+    cells = torch.ones((8, 8, 8), dtype=torch.bool)
+    cells[:4] = False
+    thin = full_model(cells).density.detach()
+    assert float(thin.max()) == pytest.approx(-math.log(8 * 2**2))  # optical depth 1 across
+    grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, cells, 2)
+    grid.carved = True
+    carved = LeanModel(LeanModelConfig(size="tiny"), np.random.default_rng(0), grid)
+    assert float(carved.density.detach().min()) == INITIAL_RAW_DENSITY
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.0, (2.0, 2.0, 2.0)), (0.5, (2.0, 2.5, 3.0))])
+def test_rays_begin_at_a_share_of_the_way_to_the_focus(share: float, expected: tuple[float, ...]) -> None:
+    """From 3, 5 and 12 away, 3 beyond where training views were at most 6 away; near is 2."""
+    model = full_model(torch.ones((80, 80, 80), dtype=torch.bool))  # from -1 to 19
+    model.grid.focus = torch.tensor([9.0, 9.0, 9.0, share, 6.0], dtype=torch.float64)
+    origins = torch.tensor([[9.0, 9.0, 12.0], [9.0, 4.0, 9.0], [9.0 + 12.0, 9.0, 9.0]])
+    directions = torch.nn.functional.normalize(9 - origins, dim=1)
+    norm = {"directions_norm": torch.ones(3, 1)}
+    spans = model._spans(RayBundle(origins, directions, torch.zeros((3, 1), dtype=torch.int64), norm))
+    begin = spans.begin * float(model.grid.cell_size)
+    torch.testing.assert_close(begin, torch.tensor(expected))
 
 
 @pytest.mark.parametrize("channels", [3, 4])

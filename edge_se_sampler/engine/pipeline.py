@@ -12,7 +12,7 @@ from edge_se_sampler.data.datamanager import VanillaDataManager
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import Model, ModelConfig
+from edge_se_sampler.models.config import LeanModelConfig, Model, ModelConfig
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.depths import find_depths
@@ -68,14 +68,18 @@ class Pipeline:
 def analyze_views(views: Views, config: ModelConfig) -> SceneAnalysis:
     """`analyze_scene` with a model's settings."""
     size_px, by_alpha = config.voxel_size_px, config.culls_by_alpha
-    return analyze_scene(views, *config.depths, voxel_size_px=size_px, by_alpha=by_alpha)
+    share = config.near_share or 0.0 if isinstance(config, LeanModelConfig) else 0.0
+    return analyze_scene(views, *config.depths, voxel_size_px=size_px, by_alpha=by_alpha, near_share=share)
 
 
 def resolve_depths(views: Views, config: Model) -> tuple[Model, str]:
-    """The config with near and far, where they are left out, from the training views, and their source."""
+    """The config with near and far, where they are left out, from the training views, and their source; a near share
+    that is left out follows from it."""
     if config.near is not None and config.far is not None:
         return config, "the settings"
     found = find_depths(views)
+    if isinstance(config, LeanModelConfig) and config.near_share is None and config.near is None:
+        config = replace(config, near_share=found.near_share)
     near = found.near if config.near is None else config.near
     far = found.far if config.far is None else config.far
     source = found.source if config.near is config.far is None else f"{found.source} and the settings"

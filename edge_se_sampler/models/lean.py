@@ -105,11 +105,10 @@ class LeanModel(RayModel):
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
         self.fine = ColorNetwork(rng)
-        uncarved = grid.occupied.sum() > 0.9 * grid.size.prod()
         across = float(grid.size.max()) * 2 ** int(grid.max_level)
-        # an uncarved box: optical depth 1 across, or more where samples of so little opacity would be left out
+        # where nothing was carved: optical depth 1 across, or more where samples of so little would be left out
         thin = max(-math.log(across), self.marching.density_min + FOG_MARGIN)
-        raw = thin if uncarved else INITIAL_RAW_DENSITY
+        raw = INITIAL_RAW_DENSITY if grid.carved else thin
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
         draws = rng.standard_normal((grid.num_rows, FEATURE_DIM), dtype=np.float32) * np.float32(0.01)
         self.features = nn.Parameter(torch.from_numpy(draws))
@@ -175,7 +174,9 @@ class LeanModel(RayModel):
         return outputs | {"background": background}, rendered
 
     def _spans(self, rays: RayBundle) -> RaySpans:
-        """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it."""
+        """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it. Where a
+        share of the way to the focus is empty, they begin no nearer: right before a camera, where no other image tells,
+        training would put a picture of its image, which other views see as floaters."""
         cell_size = float(self.grid.cell_size)
         origins = self.grid.to_cell_units(rays.origins).to(self.dtype)
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
@@ -184,6 +185,10 @@ class LeanModel(RayModel):
         near, far = (depth * norm for depth in self.config.depths)
         if "nears" in rays.metadata:
             near, far = (rays.metadata[name][:, 0] / cell_size for name in ("nears", "fars"))
+        *focus, share, farthest = self.grid.focus.tolist()
+        if share:
+            distance = (rays.origins - rays.origins.new_tensor(focus)).norm(dim=1).clamp(max=farthest)
+            near = torch.maximum(near, share * distance * norm)
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
         # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid

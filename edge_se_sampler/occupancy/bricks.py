@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +24,7 @@ BRICK = 4
 """Cells along a brick."""
 MAX_DISTANCE = 8
 """Distances between bricks are counted up to here."""
-EXACT = ("aabb_min", "cell_size", "finest_size")
+EXACT = ("aabb_min", "cell_size", "finest_size", "focus")
 """What a grid has in float64: it stays on the CPU, and keeps its type."""
 OFFSETS = torch.cartesian_prod(*[torch.arange(2)] * 3)
 """(8, 3) int64: the corners of a cell, or a brick and its upper neighbors; the last axis is the fastest."""
@@ -42,7 +43,12 @@ class BrickGrid(nn.Module):
         occupied: (k, 64) bool: which of their cells are.
         max_level: how often the cells may be subdivided.
         num_pixels: pixels of the training images that show something of the scene.
+        focus: (5,) float64, world units: the point that the training views look at; what share of the way to it has
+            nothing in it that they see; and how far away from it they are at most.
     """
+
+    carved: bool = False
+    """Whether cells were left out in which masks show nothing; not in the state."""
 
     aabb_min: Tensor
     cell_size: Tensor
@@ -64,6 +70,7 @@ class BrickGrid(nn.Module):
     """() int64."""
     num_pixels: Tensor
     """() int64."""
+    focus: Tensor
     scene: Tensor
     """(32,) uint8: digest of the box and the cells at level 0."""
     neighbors: Tensor
@@ -86,6 +93,7 @@ class BrickGrid(nn.Module):
         occupied: Tensor,
         max_level: int,
         num_pixels: int,
+        focus: Tensor | None = None,
     ) -> None:
         super().__init__()
         content = [values.cpu().numpy().tobytes() for values in (aabb_min.cpu().double(), bricks, occupied)]
@@ -99,6 +107,7 @@ class BrickGrid(nn.Module):
         self.register_buffer("aabb_min", aabb_min.cpu().double())
         self.register_buffer("cell_size", torch.tensor(cell_size, dtype=torch.float64))
         self.register_buffer("size", torch.tensor(size))
+        self.register_buffer("focus", torch.zeros(5).double() if focus is None else focus.cpu().double())
         self.register_buffer("bricks", self._bricks_of_corners(bricks, occupied))
         self._index_bricks()
         stored = torch.zeros((len(self.bricks), BRICK**3), dtype=torch.bool, device=bricks.device)
@@ -109,24 +118,36 @@ class BrickGrid(nn.Module):
 
     @classmethod
     def from_cells(
-        cls, aabb_min: Tensor, cell_size: float, cells: Tensor, max_level: int = 0, num_pixels: int = 0
+        cls,
+        aabb_min: Tensor,
+        cell_size: float,
+        cells: Tensor,
+        max_level: int = 0,
+        num_pixels: int = 0,
+        focus: Tensor | None = None,
     ) -> BrickGrid:
         """A box's cells (X, Y, Z) bool, of which those are occupied."""
         padded = F.pad(cells, [pad for size in reversed(cells.shape) for pad in (0, -size % BRICK)])
         x, y, z = (size // BRICK for size in padded.shape)
         blocks = padded.reshape(x, BRICK, y, BRICK, z, BRICK).permute(0, 2, 4, 1, 3, 5).flatten(3)
         bricks = torch.nonzero(blocks.any(dim=3))
-        return cls(aabb_min, cell_size, cells.shape, bricks, blocks[tuple(bricks.T)], max_level, num_pixels)
+        return cls(aabb_min, cell_size, cells.shape, bricks, blocks[tuple(bricks.T)], max_level, num_pixels, focus)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor]) -> BrickGrid:
         """The grid whose `state_dict` that is."""
         grid = cls.from_cells(state["aabb_min"], 1.0, torch.zeros((1, 1, 1), dtype=torch.bool))
+        state = {"focus": grid.focus, **state}  # earlier versions had none
         for name in grid.state_dict():
             setattr(grid, name, state[name].clone(memory_format=torch.contiguous_format))
         grid._index_bricks()
         grid.set_sampled(grid.sampled)
         return grid
+
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        state, prefix = arguments[:2]
+        state.setdefault(f"{prefix}focus", self.focus)  # earlier versions had none
+        super()._load_from_state_dict(*arguments, **options)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> BrickGrid:
         """Move to another device, but for `EXACT`, which some do not have."""
@@ -248,7 +269,7 @@ class BrickGrid(nn.Module):
             occupied.append((around & inner).flatten(1))
         occupied = torch.cat(occupied)
         some = occupied.any(dim=1)
-        scene = int(self.max_level), int(self.num_pixels)
+        scene = int(self.max_level), int(self.num_pixels), self.focus
         finer = BrickGrid(self.aabb_min, cell_size, size.tolist(), bricks[some], occupied[some], *scene).to(kept.device)
         finer.level, finer.finest_size, finer.scene = self.level + 1, self.finest_size, self.scene
         return finer

@@ -31,6 +31,10 @@ CAMERA_FACTORS = 0.3, 2.0
 """Near and far of cameras alone, as multiples of their median distance from the focus: as far behind it as they are
 before it; and nothing that only one or two of them see, for there a model can make up something for each image."""
 
+NEAR_SHARE = 0.45
+"""Part of the way from a camera to the focus in which nothing is that it sees, where no masks tell; at most, where
+points do. A camera that is close to what it shows is so to the focus, too."""
+
 
 @dataclass(frozen=True)
 class DepthRange:
@@ -40,6 +44,8 @@ class DepthRange:
     far: float
     source: str
     """What they were derived from."""
+    near_share: float = 0.0
+    """Of the way from a camera to the focus, that share has nothing in it that it sees."""
 
 
 def find_depths(views: Views) -> DepthRange:
@@ -56,13 +62,14 @@ def _depths_of_points(views: Views) -> DepthRange | None:
     """The depths at which views see points, but for the most extreme ones."""
     seen = [_depth(views.cameras, i, points) for i, points in enumerate(views.points or ())]
     depths = np.concatenate(seen) if seen else np.empty(0)
-    depths = depths[depths > 0]
-    if not len(depths):
+    if not (depths > 0).any():
         return None
-    low, high = np.percentile(depths, POINT_PERCENTILES)
-    return DepthRange(
-        *_rounded(low * (1 - POINT_MARGIN), high * (1 + POINT_MARGIN)), "the points of the reconstruction"
-    )
+    _, focus_depth = find_focus(views.cameras)
+    share = depths / np.repeat(focus_depth, [len(points) for points in seen])
+    low, high = np.percentile(depths[depths > 0], POINT_PERCENTILES)
+    least = np.percentile(share[depths > 0], POINT_PERCENTILES[0])
+    near, far, share = _rounded(low * (1 - POINT_MARGIN), high * (1 + POINT_MARGIN), least * (1 - POINT_MARGIN))
+    return DepthRange(near, far, "the points of the reconstruction", min(max(share, 0.0), NEAR_SHARE))
 
 
 def _depths_of_silhouettes(views: Views) -> DepthRange | None:
@@ -78,8 +85,8 @@ def _depths_of_silhouettes(views: Views) -> DepthRange | None:
         return None
     lowest, highest = _depths_of_hull(views.cameras, hull)
     reach = np.sqrt(3) / 2 * cell_size  # of a cell around its center
-    near, far = max(lowest - reach, CAMERA_FACTORS[0] * distance), highest + reach
-    return DepthRange(*_rounded(near, far), "the silhouettes") if near < far else None
+    near, far = _rounded(max(lowest - reach, CAMERA_FACTORS[0] * distance), highest + reach)
+    return DepthRange(near, far, "the silhouettes") if near < far else None
 
 
 def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[float, float]:
@@ -102,8 +109,8 @@ def _depths_of_cameras(views: Views) -> DepthRange | None:
     distance = float(np.median(depth))
     if len(views.cameras) < 2 or not distance > 0:
         return None
-    near, far = (factor * distance for factor in CAMERA_FACTORS)
-    return DepthRange(*_rounded(near, far), "the cameras: 0.3 to 2 times as far as what they look at")
+    near, far = _rounded(*(factor * distance for factor in CAMERA_FACTORS))
+    return DepthRange(near, far, "the cameras: 0.3 to 2 times as far as what they look at", NEAR_SHARE)
 
 
 def _depth(cameras: Cameras, camera: int, points: np.ndarray) -> np.ndarray:
@@ -111,6 +118,6 @@ def _depth(cameras: Cameras, camera: int, points: np.ndarray) -> np.ndarray:
     return cameras.project(camera, torch.from_numpy(points))[1].numpy()
 
 
-def _rounded(near: float, far: float) -> tuple[float, float]:
+def _rounded(*values: float) -> tuple[float, ...]:
     """Four digits of each: what config.json and a flag can repeat."""
-    return float(f"{near:.4g}"), float(f"{far:.4g}")
+    return tuple(float(f"{value:.4g}") for value in values)

@@ -21,12 +21,15 @@ def check_grid(state: Mapping[str, Tensor]) -> None:
     """ValueError if the `state_dict` of a `BrickGrid` is none, or its box takes more memory than is available; KeyError
     if parts are missing."""
     own = BrickGrid.from_cells(torch.zeros(3), 1.0, torch.zeros((1, 1, 1), dtype=torch.bool)).state_dict()
+    state = {"focus": own["focus"], **state}
     k = len(state["bricks"]) if state["bricks"].ndim else 0
     lengths = {"bricks": k, "occupied": k, "sampled": k, "max_weight": BRICK**3 * k}
     for name, value in own.items():
         shape = (lengths.get(name, len(value)), *value.shape[1:]) if value.ndim else ()
         if state[name].dtype != value.dtype or state[name].shape != shape:
             raise ValueError(f"{name} is no grid's")
+    if not (state["focus"].abs() < 1e30).all() or not 0 <= state["focus"][3] <= 1 or state["focus"][4] < 0:
+        raise ValueError("its focus is none")
     scales = torch.stack((state["cell_size"], state["finest_size"]))
     if not ((scales > 1e-30) & (scales < 1e30)).all() or not (state["aabb_min"].abs() < 1e30).all():
         raise ValueError("its box is none")

@@ -14,7 +14,16 @@ import torch
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.occupancy.bricks import BrickGrid
-from edge_se_sampler.occupancy.hull import Box, Hull, Silhouette, carve, find_box, find_hit_pixels, find_silhouettes
+from edge_se_sampler.occupancy.hull import (
+    Box,
+    Hull,
+    Silhouette,
+    carve,
+    find_box,
+    find_focus,
+    find_hit_pixels,
+    find_silhouettes,
+)
 
 MAX_INITIAL_CELLS = 2**18
 """Of the cells with which training begins: more take long to carve."""
@@ -39,22 +48,30 @@ class SceneAnalysis:
     """(H, W) bool of each view: the pixels whose rays hit the hull, and few others."""
     num_pixels: int
     """Pixels of all views that show something: as alpha has it, where the hull was carved by that."""
+    focus: np.ndarray
+    """(5,) float64, as `BrickGrid`'s."""
 
     def grid(self) -> BrickGrid:
         """The cells with which training begins, with nothing else around them."""
         hull = self.hull
         cells = torch.from_numpy(hull.cells)
         corner = torch.from_numpy(hull.aabb_min)
-        return BrickGrid.from_cells(corner, hull.cell_size, cells, self.max_level, self.num_pixels)
+        focus = torch.from_numpy(self.focus)
+        grid = BrickGrid.from_cells(corner, hull.cell_size, cells, self.max_level, self.num_pixels, focus)
+        grid.carved = self.num_silhouettes > 0
+        return grid
 
 
-def analyze_scene(views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool) -> SceneAnalysis:
+def analyze_scene(
+    views: Views, near: float, far: float, *, voxel_size_px: float, by_alpha: bool, near_share: float = 0.0
+) -> SceneAnalysis:
     """Derive the cells of a scene from its training views, whose rays are sampled between depths near and far.
 
     Args:
         voxel_size_px: size of the cells that are wanted in the end, in footprints of a pixel. Training begins with
             cells 2^k times as large, k at least MIN_LEVELS, of which at most MAX_INITIAL_CELLS fill the hull.
         by_alpha: whether the visual hull is carved from alpha.
+        near_share: of the way to what a view looks at, that share has nothing in it.
 
     Raises:
         InputError: the cameras see nothing between near and far.
@@ -73,7 +90,10 @@ def analyze_scene(views: Views, near: float, far: float, *, voxel_size_px: float
         raise _nothing_seen(box)
     shown = (_foreground(image) if i in silhouettes else image[..., 0] >= 0 for i, image in enumerate(views.images))
     num_pixels = sum(int(mask.sum()) for mask in shown)
-    return SceneAnalysis(box, len(silhouettes), hull, max_level, hit_pixels, num_pixels)
+    point, _ = find_focus(views.cameras)
+    distances = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - point, axis=1)
+    focus = np.array([*point, near_share, distances.max()])
+    return SceneAnalysis(box, len(silhouettes), hull, max_level, hit_pixels, num_pixels, focus)
 
 
 def _carve_initial(

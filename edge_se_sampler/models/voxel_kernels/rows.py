@@ -111,7 +111,7 @@ def adam_rows(
     """As `voxel_ops.adam_rows`."""
     arrays = [value.detach().numpy() for value in (values, mean, square)]
     rows = gradient._indices()[0]
-    if (rows[1:] > rows[:-1]).all():  # of one backward pass, which autograd does not remember
+    if _ascend(rows.numpy()):  # of one backward pass, which autograd does not remember
         gradient._coalesced_(True)
     gradient = gradient.coalesce()
     rows, sums = gradient.indices()[0].numpy(), gradient.values().numpy()
@@ -123,6 +123,15 @@ def adam_rows(
     if total_variation:
         _add_total_variation(flat[0], rows, sums.reshape(-1), f32(total_variation))
     _adam_features(*flat, rows, sums.reshape(-1), *numbers)
+
+
+@njit(cache=True)
+def _ascend(rows):
+    """Whether each row is greater than the one before."""
+    ascend = True
+    for i in range(1, len(rows)):
+        ascend &= rows[i] > rows[i - 1]
+    return ascend
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
