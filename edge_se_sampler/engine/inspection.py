@@ -74,7 +74,9 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
         "data": views.describe(),
         "memory": views.memory or "not known of views that were made in memory",
-        "depths": f"{config.near:g} to {config.far:g}, by {depth_source}",
+        "depths": f"{config.near:g} to {config.far:g}, by {depth_source}"
+        + f"; nothing nearer than {100 * (config.near_share or 0):g} % of the way to what a view looks at"
+        * bool(config.near_share),
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
         "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",
