@@ -29,6 +29,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "pixels by cached errors": {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"},
     "one ray a pixel": {f"{MODEL}.supersample": False},
     "no hull": {f"{MODEL}.cull_by_alpha": False},
+    "rays from near on": {f"{MODEL}.near_share": 0.0},
     "no total variation": {f"{MODEL}.total_variation": 0.0},
     "no alpha loss": {f"{MODEL}.alpha_loss": 0.0},
     "random background": {f"{MODEL}.background_color": "random"},
