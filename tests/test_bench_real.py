@@ -179,6 +179,13 @@ def test_the_chart_has_a_panel_for_every_scene_and_size(tmp_path: Path) -> None:
     assert (folder / "chart.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("trained", [[], [run_of(30.0, 0)]])
+def test_a_variant_without_what_it_is_compared_with_is_not_drawn(trained: list[dict[str, Any]], tmp_path: Path) -> None:
+    folder = result_of(tmp_path, [*trained, run_of(29.0, 0, scene="chair", variant="no total variation")])
+    draw(folder, None)
+    assert (folder / "chart.png").exists() == bool(trained)
+
+
 def test_without_variants_there_is_no_section_of_them(tmp_path: Path) -> None:
     assert "One thing changed" not in describe(result_of(tmp_path, [run_of(30.0, 0)]))
 

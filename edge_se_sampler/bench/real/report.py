@@ -38,7 +38,7 @@ Baselines = Mapping[str, Mapping[str, Any]]
 def draw(folder: Path, workplace: Path | None) -> None:
     del workplace
     result, baselines = _read(folder)
-    if runs := timed(result["runs"]):
+    if runs := [run for run in timed(result["runs"]) if run["variant"] in (BASELINE, WITHOUT_MASKS)]:
         save_figure(draw_chart(runs, baselines), folder / "chart.png")
 
 
