@@ -45,6 +45,7 @@ def rank_and_threads() -> tuple[int, int]:
     return ranks.rank(), torch.get_num_threads()
 
 
+@pytest.mark.slow
 def test_the_command_times_both_and_reports(scene: Path, tmp_path: Path, edge_se: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(timing, "cached_scene", lambda *_, **__: scene)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
