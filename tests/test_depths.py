@@ -14,11 +14,12 @@ from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.dataset import read_split
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.config import override
+from edge_se_sampler.engine.config import TrainerConfig, override
 from edge_se_sampler.engine.pipeline import resolve_depths
 from edge_se_sampler.engine.session import resolve_config
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.occupancy.depths import NEAR_SHARE, find_depths
 from edge_se_sampler.occupancy.hull import find_focus
 
@@ -32,6 +33,11 @@ def moved(views: Views, scale: float, shift: tuple[float, float, float]) -> View
         poses, fx=c.fx[:, 0], fy=c.fy[:, 0], cx=c.cx[:, 0], cy=c.cy[:, 0], width=c.width[:, 0], height=c.height[:, 0]
     )
     return replace(views, cameras=cameras, depths=None)
+
+
+def lean_model(config: TrainerConfig) -> LeanModelConfig:
+    assert isinstance(config.pipeline.model, LeanModelConfig)
+    return config.pipeline.model
 
 
 def opaque(views: Views) -> Views:
@@ -85,7 +91,7 @@ def test_a_single_camera_tells_nothing() -> None:
     with pytest.raises(InputError, match="give both near and far"):
         resolve_config(config, view)
     given = override(config, {"pipeline.model.near": 10.0, "pipeline.model.far": 60.0})
-    model = resolve_config(given, view).pipeline.model
+    model = lean_model(resolve_config(given, view))
     assert (model.depths, model.near_share) == ((10, 60), None)
 
 
@@ -108,12 +114,12 @@ def test_the_config_records_depths_and_flags_insist(tmp_path: Path) -> None:
     assert views is not None
     config = method_configs()["lean-nerf"]
     resolved = resolve_config(config, views)
-    model = resolved.pipeline.model
+    model = lean_model(resolved)
     found = find_depths(views)
     assert (model.near, model.far, model.near_share) == (found.near, found.far, found.near_share)
     assert (resolved.data_format, resolved.eval_every) == ("colmap", 8)
     assert resolve_config(resolved, views) == resolved
-    given = resolve_config(override(config, {"pipeline.model.near": 0.5}), views).pipeline.model
+    given = lean_model(resolve_config(override(config, {"pipeline.model.near": 0.5}), views))
     assert (given.near, given.far, given.near_share) == (0.5, model.far, None)
     _, source = resolve_depths(views, replace(config.pipeline.model, near=0.5))
     assert source == f"{find_depths(views).source} and the settings"
