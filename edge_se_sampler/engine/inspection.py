@@ -69,14 +69,14 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
     num_cells = max(hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3)
     distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
     center = ", ".join(f"{value + 0.0:.2f}" for value in box.center.round(2))
+    part = config.near_share
+    nearer = f"; nothing nearer than {100 * part:g} % of the way to what a view looks at" if part else ""
     share = np.mean(np.concatenate([hit.ravel() for hit in analysis.hit_pixels]))
     return {
         "views": f"{num_views} of {sizes}, {np.median(distance):.2f} from what they look at, ({center})",
         "data": views.describe(),
         "memory": views.memory or "not known of views that were made in memory",
-        "depths": f"{config.near:g} to {config.far:g}, by {depth_source}"
-        + f"; nothing nearer than {100 * (config.near_share or 0):g} % of the way to what a view looks at"
-        * bool(config.near_share),
+        "depths": f"{config.near:g} to {config.far:g}, by {depth_source}{nearer}",
         "pixel": f"{footprint:.4f} wide there: distance / focal length",
         "box": f"{2 * box.half_extent:.2f} a side: as deep as rays are sampled",
         "silhouettes": f"{analysis.num_silhouettes} of {num_views} views tell the object from its background by alpha",

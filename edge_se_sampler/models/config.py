@@ -186,8 +186,8 @@ class LeanModelConfig(ModelConfig):
     cull_by_alpha: bool = True
     """Leave out what lies outside the visual hull of the alpha masks."""
     near_share: float | None = field(default=None, metadata=ADDED_LATER)
-    """Rays begin no nearer than at this share of the way to what the cameras look at. By default 0.45 in captures whose
-    near is left out and not told by masks, else 0."""
+    """Rays begin no nearer than at this share of the way to what the cameras look at. By default, in captures without
+    masks, 0.45, or less where a reconstruction has closer points; 0 with masks, and where near is given."""
     step_size_voxels: float = 1.0
     """Distance between samples, as a multiple of a cell's size."""
     alpha_threshold: float = 0.02
@@ -230,8 +230,10 @@ class LeanModelConfig(ModelConfig):
         super().check(prefix)
         step = self.step_size_voxels
         check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
-        for name in ("near_share", "alpha_threshold", "weight_threshold", "transmittance_threshold", "prune_weight"):
-            value = getattr(self, name) or 0.0
+        share = self.near_share
+        check_value(f"{prefix}near-share", share, share is None or 0 <= share < 1, "in [0, 1)")
+        for name in ("alpha_threshold", "weight_threshold", "transmittance_threshold", "prune_weight"):
+            value = getattr(self, name)
             check_value(prefix + name.replace("_", "-"), value, 0 <= value < 1, "in [0, 1)")
         for name in ("total_variation", "alpha_loss"):
             value = getattr(self, name)
