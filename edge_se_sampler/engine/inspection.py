@@ -30,7 +30,10 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
     ends = hull.aabb_min + np.array(hull.cells.shape) * hull.cell_size
     poses = views.cameras.camera_to_worlds.numpy()
     some = poses[:: -(-len(poses) // NUM_AXES)]
-    sampled = some[:, :, 3] - np.multiply.outer(config.depths, some[:, :, 2])  # optical axes, from near to far
+    (near, far), (*focus, nearest_share, _) = config.depths, analysis.focus
+    begin = np.maximum(near, nearest_share * np.linalg.norm(some[:, :, 3] - focus, axis=1))
+    depths = np.stack((begin, np.full_like(begin, far)))
+    sampled = some[:, :, 3] - depths[..., None] * some[:, :, 2]  # optical axes, as far as rays are sampled
     for axis, along in zip(axes[0], (1, 0, 2), strict=True):  # how many cells lie one after another
         right, up = (other for other in range(3) if other != along)
         extent = (hull.aabb_min[right], ends[right], hull.aabb_min[up], ends[up])
