@@ -73,6 +73,7 @@ def test_a_time_budget_is_kept_and_its_plan_repeats_it_bit_for_bit(
         ({"segments": (1, 2, 3)}, "--segments"),
         ({f"{MODEL}.prune_weight": 1.0}, "prune-weight"),
         ({f"{MODEL}.max_memory": 0.0}, "max-memory"),
+        ({f"{MODEL}.max_memory": 1e300}, "max-memory"),
     ],
 )
 def test_bad_settings_are_refused(changes: dict[str, Any], message: str) -> None:

@@ -17,6 +17,8 @@ BYTES_PER_RAY = 2**15
 """Of the lean model's samples on a ray of a training step."""
 GIB_PER_PIXEL = 1 / 400
 """Memory of the lean model's cells, by the longest side of the images."""
+MAX_MEMORY = 2**20
+"""GiB for them: more would be a mistake, or a stranger's."""
 POINTS_PER_CHUNK = {"cpu": 2**14, "cuda": 2**19}
 """Points that NeRF evaluates at once, by device: bounds the memory. Each chunk draws its own jitter, so another value
 gives another (equally good) training run."""
@@ -222,7 +224,7 @@ class LeanModelConfig(ModelConfig):
         """The rows of cells and their corners, and the samples of a step's rays; the box that holds them, most of it
         empty, takes as much again where no hull makes it small."""
         assert self.max_memory is not None
-        valid = 0 < self.max_memory < INFINITY  # what is not, is refused later
+        valid = 0 < self.max_memory <= MAX_MEMORY  # what is not, is refused later
         rows = int(self.max_memory * 2**30 if valid else 0)
         return (rows if has_alpha and self.cull_by_alpha else 2 * rows) + BYTES_PER_RAY * self.preset.rays
 
@@ -239,7 +241,8 @@ class LeanModelConfig(ModelConfig):
             value = getattr(self, name)
             check_value(prefix + name.replace("_", "-"), value, 0 <= value < INFINITY, "at least 0")
         memory = self.max_memory
-        check_value(f"{prefix}max-memory", memory, memory is None or 0 < memory < INFINITY, "above 0")
+        limits = f"above 0 and at most {MAX_MEMORY:,}"
+        check_value(f"{prefix}max-memory", memory, memory is None or 0 < memory <= MAX_MEMORY, limits)
         for name in ("density_lr_scale", "feature_lr_scale"):
             value = getattr(self, name)
             check_value(prefix + name.replace("_", "-"), value, 0 < value < INFINITY, "above 0")
