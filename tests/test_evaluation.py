@@ -17,7 +17,7 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on
-from edge_se_sampler.engine.rendering import Picture, render_rays, render_view, to_pictures
+from edge_se_sampler.engine.rendering import Picture, measure_psnr, render_rays, render_view, to_pictures
 from edge_se_sampler.models import nerf as model_module
 from edge_se_sampler.models.nerf import NeRFModel
 
@@ -94,7 +94,7 @@ def test_a_view_is_rendered_pixel_by_pixel_and_clipped() -> None:
     views = tiny_views(2, 5, 7)
     model = model_of(density_activation="softplus").eval()
     picture = to_pictures(views)[1]
-    rendered, decibel = render_view(model, picture)
+    rendered = render_view(model, picture)
     assert rendered.shape == (5, 7, 3)
     for row, column in ((0, 0), (0, 6), (4, 0), (2, 3)):
         ray = views.cameras.to(dtype=torch.float32).pixel_rays(torch.tensor([[1, row, column]]))
@@ -103,7 +103,7 @@ def test_a_view_is_rendered_pixel_by_pixel_and_clipped() -> None:
         np.testing.assert_allclose(rendered[row, column], expected, atol=1e-6)
     assert len(np.unique(rendered.reshape(-1, 3).round(5), axis=0)) > 20
     error = (rendered.astype(np.float64) - composite_on(picture.image)) ** 2
-    assert decibel == pytest.approx(-10 * math.log10(error.mean()))
+    assert measure_psnr(rendered, picture, 1.0) == pytest.approx(-10 * math.log10(error.mean()))
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -129,7 +129,7 @@ def test_no_more_rays_of_a_view_are_made_than_are_rendered_at_once(monkeypatch: 
     expected, counts = render_rays(model, picture.rays(torch.device("cpu"))), []
     pixel_rays = Cameras.pixel_rays
     monkeypatch.setattr(Cameras, "pixel_rays", lambda self, some: counts.append(len(some)) or pixel_rays(self, some))
-    rendered, _ = render_view(model, picture)
+    rendered = render_view(model, picture)
     assert sum(counts) == 35
     assert max(counts) == model.rays_per_chunk < 35
     np.testing.assert_array_equal(rendered.reshape(-1, 3), expected.clamp(0, 1))
@@ -143,7 +143,8 @@ def test_masked_pixels_do_not_count_and_views_without_others_are_left_out() -> N
     mask[:, 3:] = True
     pictures = to_pictures(views_of(image, image).with_masks([mask, mask & False]))
     assert [picture.name for picture in pictures] == ["view 0"]
-    assert evaluate(empty_model(), pictures)["psnr"] == render_view(empty_model(), pictures[0])[1] == 100
+    rendered = render_view(empty_model(), pictures[0])
+    assert evaluate(empty_model(), pictures)["psnr"] == measure_psnr(rendered, pictures[0], 1.0) == 100
 
 
 def test_the_callback_gets_every_view_in_order() -> None:
@@ -167,9 +168,10 @@ def test_colors_above_one_are_clipped(monkeypatch: pytest.MonkeyPatch) -> None:
         return {"rgb_fine": torch.full((len(rays), 3), 1.5)}
 
     monkeypatch.setattr(model, "forward", too_bright)
-    rendered, decibel = render_view(model, to_pictures(views_of(np.full((4, 4, 3), 255, dtype=np.uint8)))[0])
+    picture = to_pictures(views_of(np.full((4, 4, 3), 255, dtype=np.uint8)))[0]
+    rendered = render_view(model, picture)
     assert (rendered == 1).all()
-    assert decibel == 100
+    assert measure_psnr(rendered, picture, 1.0) == 100
 
 
 def test_a_diverged_model_raises_instead_of_returning_nan() -> None:

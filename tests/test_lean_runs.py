@@ -20,7 +20,7 @@ from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MANAGER, MODEL, SAMPLER, TrainerConfig, override
 from edge_se_sampler.engine.inspection import inspect
 from edge_se_sampler.engine.pipeline import analyze_views, load_weights, saved_grid
-from edge_se_sampler.engine.rendering import render_rays, render_view, to_pictures
+from edge_se_sampler.engine.rendering import measure_psnr, render_rays, render_view, to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import describe_run, load_model, prepare, prepare_resume
 from edge_se_sampler.engine.trainer import Trainer
@@ -124,7 +124,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     assert views.train_pixel_sampler.config.late == "uniform"
     trainer.train()
     picture = to_pictures(read_blender(larger, "test"))[0]
-    _, psnr = render_view(model, picture)
+    psnr = measure_psnr(render_view(model, picture), picture, 1.0)
     away = picture.image[..., 3:] * (1 - picture.image[..., :3])
     background = -10 * np.log10(np.mean(away.astype(np.float64) ** 2))
     assert 5 < background < 30

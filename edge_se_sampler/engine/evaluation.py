@@ -26,7 +26,7 @@ def evaluate(
     num_images, and `images`, the metrics of each. lpips is None: its weights are not part of this package."""
     rows = []
     for i, picture in enumerate(pictures):
-        rendered, _ = render_view(model, picture)
+        rendered = render_view(model, picture)
         metrics = compute_metrics(rendered, picture.image, model.config.background_level, picture.mask)
         rows.append({"name": picture.name, **metrics})
         if on_view is not None:

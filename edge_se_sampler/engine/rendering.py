@@ -79,17 +79,20 @@ def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torc
     return render_outputs(model, rays, [key])[key]
 
 
-def render_view(model: RayModel, picture: Picture) -> tuple[np.ndarray, float]:
-    """A view's rendering (H, W, 3) in [0, 1] and its PSNR over the pixels that are known; FloatingPointError if a
-    rendered value is not finite."""
+def render_view(model: RayModel, picture: Picture) -> np.ndarray:
+    """A view's rendering (H, W, 3) in [0, 1]; FloatingPointError if a rendered value is not finite."""
     height, width = picture.image.shape[:2]
     chunks = model.chunks(height * width)  # all rays of a photo would take gigabytes
     parts = [render_rays(model, picture.rays(model.device, pixels)) for pixels in chunks]
     colors = torch.cat(parts).clamp(0, 1)
     _check_finite(colors)
-    rendered = colors.reshape(height, width, 3).numpy()
-    error = (rendered.astype(np.float64) - composite_on(picture.image, model.config.background_level)) ** 2
-    return rendered, psnr(float(error.mean() if picture.mask is None else error[picture.mask].mean()))
+    return colors.reshape(height, width, 3).numpy()
+
+
+def measure_psnr(rendered: np.ndarray, picture: Picture, background_color: float) -> float:
+    """PSNR of a view's rendering (H, W, 3) over the pixels that are known, in front of a gray background."""
+    error = (rendered.astype(np.float64) - composite_on(picture.image, background_color)) ** 2
+    return psnr(float(error.mean() if picture.mask is None else error[picture.mask].mean()))
 
 
 def _check_finite(*rendered: torch.Tensor) -> None:

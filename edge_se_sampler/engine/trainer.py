@@ -25,7 +25,7 @@ from edge_se_sampler.engine.pipeline import Pipeline, load_weights
 from edge_se_sampler.engine.plan import Plan
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
-from edge_se_sampler.engine.rendering import Picture, render_view
+from edge_se_sampler.engine.rendering import Picture, measure_psnr, render_view
 from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
 from edge_se_sampler.engine.saved_state import check_training, load_sampler
 from edge_se_sampler.errors import InputError
@@ -239,7 +239,9 @@ class Trainer:
 
     def _preview(self, step: int) -> None:
         if self.preview_picture is not None and ranks.is_main():
-            rendered, self._preview_psnr = render_view(self.pipeline.model, self.preview_picture)
+            model = self.pipeline.model
+            rendered = render_view(model, self.preview_picture)
+            self._preview_psnr = measure_psnr(rendered, self.preview_picture, model.config.background_level)
             self.early_stopping.update(self._preview_psnr)
             self._record(step, val_psnr=self._preview_psnr)
             write_image(self.run.path / "previews" / f"step-{step:09d}.png", rendered)

@@ -110,7 +110,9 @@ class LeanModel(RayModel):
         thin = max(-math.log(across), self.marching.density_min + FOG_MARGIN)
         raw = INITIAL_RAW_DENSITY if grid.carved else thin
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
-        draws = rng.standard_normal((grid.num_rows, FEATURE_DIM), dtype=np.float32) * np.float32(0.01)
+        # only a checkpoint has cells that were subdivided, and it has their features, which would take seconds to draw
+        shape = grid.num_rows, FEATURE_DIM
+        draws = np.zeros(shape, np.float32) if grid.level else rng.standard_normal(shape, np.float32) * np.float32(0.01)
         self.features = nn.Parameter(torch.from_numpy(draws))
         self.register_buffer("supersampled", torch.tensor(False))
 
@@ -125,7 +127,7 @@ class LeanModel(RayModel):
 
     @property
     def rays_per_chunk(self) -> int:
-        return 2**14
+        return 2**16
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The network; density and features learn faster, for each sees few samples."""
