@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,11 @@ def test_fox(capsys: pytest.CaptureFixture[str]) -> None:
     assert train.images[0].shape == (240, 135, 3)
     # the zoom that leaves nothing unknown
     assert 1375.52 < 8 * float(train.cameras.fx[0]) < 1.02 * 1375.52
-    assert "cameras" in find_depths(train).source
+    found = find_depths(train)
+    assert found.source == "features that several images show"
+    assert 0.4 < found.near_share < 0.55
+    assert 1.5 < found.near < 2
+    assert 9 < found.far < 11
 
 
 def test_colmap_mug() -> None:
@@ -54,6 +59,10 @@ def test_colmap_mug() -> None:
     found = find_depths(train)
     assert found.source == "the points of the reconstruction"
     assert 0 < found.near < 4 < found.far < 20
+    without = find_depths(replace(read("colmap_mug", downscale=2), points=None))
+    assert without.source == "features that several images show"
+    assert 0 < without.near < found.near
+    assert without.far == pytest.approx(found.far, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +73,18 @@ def test_masked_objects(name: str, near: tuple[float, float], far: tuple[float, 
     assert views.data_format == "blender"
     found = find_depths(views)
     assert found.source == "the silhouettes"
+    assert near[0] < found.near < near[1]
+    assert far[0] < found.far < far[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "near", "far"), [("dtu_scan24", (1.8, 2.2), (4.0, 5.2)), ("ethiopianHead", (2.8, 3.3), (5.1, 6.5))]
+)
+def test_objects_without_masks(name: str, near: tuple[float, float], far: tuple[float, float]) -> None:
+    """Features alone find what silhouettes do, and leave more room behind."""
+    views = read(name)
+    found = find_depths(replace(views, images=tuple(image[..., :3].copy() for image in views.images)))
+    assert found.source == "features that several images show"
     assert near[0] < found.near < near[1]
     assert far[0] < found.far < far[1]
 

@@ -3,7 +3,8 @@
 focus  the point nearest to all optical axes
 depth  along a camera's optical axis, world units
 
-The best source there is decides: points that a reconstruction has seen, silhouettes, or the cameras alone.
+The best source there is decides: points that a reconstruction has seen, silhouettes, features that images share, or
+the cameras alone.
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.occupancy.hull import Box, Hull, carve, find_focus, find_silhouettes
+from edge_se_sampler.occupancy.triangulation import find_points
 
 POINT_PERCENTILES = 0.5, 99.5
 """Of the depths of points: a few are matched wrongly, and lie anywhere."""
 POINT_MARGIN = 0.1
 """By which the scene may reach beyond its points, as a share of their depth."""
+FEATURE_MARGIN = 0.3
+"""As that, behind features: what is far moves little from image to image, so that fewer of its are found."""
 HULL_RESOLUTION = 64
 """Cells along the cube that silhouettes carve; it reaches from the focus to the middle camera."""
 MIN_SEEN = 0.9
@@ -52,24 +56,56 @@ def find_depths(views: Views) -> DepthRange:
     """The depths of a scene, from its training views; InputError if nothing tells."""
     if views.depths is not None:
         return DepthRange(*views.depths, "NeRF's Blender scenes")
-    found = _depths_of_points(views) or _depths_of_silhouettes(views) or _depths_of_cameras(views)
+    found = (
+        _depths_of_points(views)
+        or _depths_of_silhouettes(views)
+        or _depths_of_features(views)
+        or _depths_of_cameras(views)
+    )
     if found is None:
         raise InputError("neither points, silhouettes nor cameras tell how deep the scene is: give both near and far")
     return found
 
 
 def _depths_of_points(views: Views) -> DepthRange | None:
-    """The depths at which views see points, but for the most extreme ones."""
+    """The depths at which a reconstruction's points are seen."""
+    reach = _reach(views)
+    if reach is None:
+        return None
+    low, high, share = reach
+    near, far, share = _rounded(low * (1 - POINT_MARGIN), high * (1 + POINT_MARGIN), share * (1 - POINT_MARGIN))
+    return DepthRange(near, far, "the points of the reconstruction", min(share, NEAR_SHARE))
+
+
+def _depths_of_features(views: Views) -> DepthRange | None:
+    """The depths at which features are seen that several images show; each camera's rays begin at its share of the way,
+    for features are too few to tell what the closest cameras see."""
+    found = find_points(views)
+    reach = None if found is None else _reach(found)
+    if reach is None:
+        return None
+    low, high, share = reach
+    _, depth = find_focus(views.cameras)
+    share *= 1 - POINT_MARGIN
+    near = share * depth.min() if share > 0 else low * (1 - POINT_MARGIN)
+    near, far, share = _rounded(near, high * (1 + FEATURE_MARGIN), share)
+    return DepthRange(near, far, "features that several images show", share)
+
+
+def _reach(views: Views) -> tuple[float, float, float] | None:
+    """Of the points that views see, but for the most extreme ones: the least and the greatest depth, and the least
+    share of the way to the focus, in [0, 1), 0 where there is no focus before all cameras."""
     seen = [_depth(views.cameras, i, points) for i, points in enumerate(views.points or ())]
     depths = np.concatenate(seen) if seen else np.empty(0)
-    if not (depths > 0).any():
+    ahead = depths > 0
+    if not ahead.any():
         return None
+    low, high = np.percentile(depths[ahead], POINT_PERCENTILES)
     _, focus_depth = find_focus(views.cameras)
-    share = depths / np.repeat(focus_depth, [len(points) for points in seen])
-    low, high = np.percentile(depths[depths > 0], POINT_PERCENTILES)
-    least = np.percentile(share[depths > 0], POINT_PERCENTILES[0])
-    near, far, share = _rounded(low * (1 - POINT_MARGIN), high * (1 + POINT_MARGIN), least * (1 - POINT_MARGIN))
-    return DepthRange(near, far, "the points of the reconstruction", min(max(share, 0.0), NEAR_SHARE))
+    if not (focus_depth > 0).all():
+        return low, high, 0.0
+    shares = depths / np.repeat(focus_depth, [len(points) for points in seen])
+    return low, high, min(float(np.percentile(shares[ahead], POINT_PERCENTILES[0])), 0.99)
 
 
 def _depths_of_silhouettes(views: Views) -> DepthRange | None:
