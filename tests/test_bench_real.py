@@ -32,6 +32,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_training_is_measured_on_every_split(scenes: Path, tmp_path: Path) -> None:
     run = run_trial(Trial("bricks", 1, "2s", "lean-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
     assert run.keys() == RUN.keys()

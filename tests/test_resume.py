@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -71,9 +72,9 @@ print(json.dumps({"run": str(trainer.run.path), "pixels": pixels}))
 
 def session(command: str, folder: Path, scene: Path, interrupt_at: int = -1, method: str = "edge-se-nerf") -> dict:
     arguments = [command, str(folder), str(scene), str(interrupt_at), method]
-    return json.loads(
-        subprocess.run([sys.executable, "-c", SESSION, *arguments], check=True, capture_output=True, text=True).stdout
-    )
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # more threads for so little wait for each other
+    settings: Any = {"check": True, "capture_output": True, "text": True, "env": environment}
+    return json.loads(subprocess.run([sys.executable, "-c", SESSION, *arguments], **settings).stdout)
 
 
 def metrics(run: Path) -> list[dict]:

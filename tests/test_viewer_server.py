@@ -96,7 +96,7 @@ def ended(process: subprocess.Popen) -> Iterator[None]:
         process.kill()
 
 
-@pytest.mark.parametrize("trains", [False, True])
+@pytest.mark.parametrize("trains", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, tmp_path: Path, trains: bool) -> None:
     flags = ["view", run, "--port", 0]
     if trains:

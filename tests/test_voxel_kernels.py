@@ -242,6 +242,7 @@ assert signatures() == compiled, (compiled, signatures())
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_left_to_compile_when_the_clock_runs() -> None:
     subprocess.run([sys.executable, "-c", COMPILED], check=True, cwd=Path(__file__).parent)
 
@@ -261,6 +262,7 @@ assert (torch.get_num_threads(), numba.get_num_threads()) == (2, min(2, numba.co
 """
 
 
+@pytest.mark.slow
 def test_kernels_use_as_many_threads_as_torch() -> None:
     subprocess.run([sys.executable, "-c", THREADS], check=True, cwd=Path(__file__).parent)
 
