@@ -189,7 +189,7 @@ class LeanModelConfig(ModelConfig):
     """Leave out what lies outside the visual hull of the alpha masks."""
     near_share: float | None = field(default=None, metadata=ADDED_LATER)
     """Rays begin no nearer than at this share of the way to what the cameras look at. By default, in captures without
-    masks, 0.45, or less where a reconstruction has closer points; 0 with masks, and where near is given."""
+    masks, as points or features tell, or 0.45; 0 with masks, and where near is given."""
     step_size_voxels: float = 1.0
     """Distance between samples, as a multiple of a cell's size."""
     alpha_threshold: float = 0.02

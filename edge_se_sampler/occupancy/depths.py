@@ -9,7 +9,7 @@ the cameras alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -34,10 +34,9 @@ they see."""
 CAMERA_FACTORS = 0.3, 2.0
 """Near and far of cameras alone, as multiples of their median distance from the focus: as far behind it as they are
 before it; and nothing that only one or two of them see, for there a model can make up something for each image."""
-
 NEAR_SHARE = 0.45
-"""Part of the way from a camera to the focus in which nothing is that it sees, where no masks tell; at most, where
-points do. A camera that is close to what it shows is so to the focus, too."""
+"""Part of the way from a camera to the focus in which nothing is that it sees, where neither masks nor points tell. A
+camera that is close to what it shows is so to the focus, too."""
 
 
 @dataclass(frozen=True)
@@ -67,29 +66,29 @@ def find_depths(views: Views) -> DepthRange:
     return found
 
 
-def _depths_of_points(views: Views) -> DepthRange | None:
-    """The depths at which a reconstruction's points are seen."""
+def _depths_of_points(
+    views: Views, source: str = "the points of the reconstruction", far_margin: float = POINT_MARGIN
+) -> DepthRange | None:
+    """The depths at which views see points, but for the most extreme ones."""
     reach = _reach(views)
     if reach is None:
         return None
     low, high, share = reach
-    near, far, share = _rounded(low * (1 - POINT_MARGIN), high * (1 + POINT_MARGIN), share * (1 - POINT_MARGIN))
-    return DepthRange(near, far, "the points of the reconstruction", min(share, NEAR_SHARE))
+    near, far, share = _rounded(low * (1 - POINT_MARGIN), high * (1 + far_margin), share * (1 - POINT_MARGIN))
+    return DepthRange(near, far, source, share)
 
 
 def _depths_of_features(views: Views) -> DepthRange | None:
-    """The depths at which features are seen that several images show; each camera's rays begin at its share of the way,
-    for features are too few to tell what the closest cameras see."""
-    found = find_points(views)
-    reach = None if found is None else _reach(found)
-    if reach is None:
+    """Those of points that are seen in several images; too few of them tell what the closest cameras see: their rays
+    begin at the same share of the way to the focus as others'."""
+    views_with_points = find_points(views)
+    if views_with_points is None:
         return None
-    low, high, share = reach
-    _, depth = find_focus(views.cameras)
-    share *= 1 - POINT_MARGIN
-    near = share * depth.min() if share > 0 else low * (1 - POINT_MARGIN)
-    near, far, share = _rounded(near, high * (1 + FEATURE_MARGIN), share)
-    return DepthRange(near, far, "features that several images show", share)
+    found = _depths_of_points(views_with_points, "features that several images show", FEATURE_MARGIN)
+    if found is None or not found.near_share:
+        return found
+    (closest,) = _rounded(found.near_share * find_focus(views.cameras)[1].min())
+    return replace(found, near=min(found.near, closest))
 
 
 def _reach(views: Views) -> tuple[float, float, float] | None:
