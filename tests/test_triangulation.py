@@ -100,10 +100,21 @@ def test_images_that_show_nothing_have_none(plane: Views) -> None:
     assert find_points(plane.subset([0])) is None
 
 
+@pytest.mark.parametrize("shape", [(1, 1, 3), (2, 900, 3), (7, 3, 4)])
+def test_images_of_any_size_are_looked_at(shape: tuple[int, int, int], plane: Views) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    assert find_points(replace(plane, images=(image,) * len(plane.images))) is None
+
+
 def test_cameras_that_only_turn_tell_no_depth(plane: Views) -> None:
     poses = plane.cameras.camera_to_worlds.clone()
     poses[:, :, 3] = poses[0, :, 3]
     assert find_points(replace(plane, cameras=replace(plane.cameras, camera_to_worlds=poses))) is None
+
+
+def test_rays_that_are_almost_parallel_tell_no_depth() -> None:
+    angles = np.radians(np.linspace(-0.9, 0.9, 4))
+    assert find_points(plane_views(DISTANCE * np.stack((np.sin(angles), 0 * angles, np.cos(angles)), axis=1))) is None
 
 
 def test_wrong_matches_show_by_the_cameras(plane: Views) -> None:

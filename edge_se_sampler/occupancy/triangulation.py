@@ -21,7 +21,8 @@ from edge_se_sampler.sampling.edges import luma, unit_float
 MAX_VIEWS, LONGEST_SIDE, MAX_FEATURES = 64, 400, 1000
 """Views that are looked at, pixels along their images then, and features of each: depths need no more."""
 NEIGHBORS = 1, 2, 4, 8
-"""A view is compared with those that are so manieth nearest: the nearest share most, and others tell more of depth."""
+"""With which others a view is compared, by how near they stand: the nearest share most, farther ones tell more of
+depth."""
 MAX_RATIO = 0.75
 """Of the distances of a feature to the best match and to the second (Lowe 2004, section 7.1)."""
 MAX_ERROR = 1 / 400
@@ -60,8 +61,9 @@ def _find_features(views: Views, i: int) -> _Features:
     image, known = views.images[i], None if views.masks is None else views.masks[i]
     scale = min(1.0, LONGEST_SIDE / max(image.shape[:2]))
     gray = (255 * luma(unit_float(image))).round().astype(np.uint8)
-    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    mask = None if known is None else cv2.resize(known.astype(np.uint8), small.shape[::-1])
+    height, width = (max(1, round(scale * length)) for length in gray.shape)
+    small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
+    mask = None if known is None else cv2.resize(known.astype(np.uint8), (width, height))
     keypoints, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(small, mask)
     if descriptors is None:  # there are none
         return _Features(np.empty((0, 2)), np.empty((0, 128), np.float32), 0)
