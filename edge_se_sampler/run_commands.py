@@ -49,10 +49,17 @@ class _RunCommand:
     """The run's folder."""
 
     def _load(self) -> tuple[RunFolder, TrainerConfig]:
-        from edge_se_sampler.engine.run_folder import RunFolder
+        return load_run(self.run_folder)
 
-        run = RunFolder(self.run_folder)
-        return run, run.config(method_configs())
+
+@dataclass(frozen=True)
+class _PictureCommand(_RunCommand):
+    average_with: tuple[Path, ...] = ()
+    """More runs on the same data, with other seeds: pictures are the mean of what all of them render, which is better
+    than any, and takes as much longer."""
+
+    def _load_all(self) -> list[tuple[RunFolder, TrainerConfig]]:
+        return [load_run(folder) for folder in (self.run_folder, *self.average_with)]
 
 
 @dataclass(frozen=True)
@@ -73,7 +80,7 @@ class Resume(_RunCommand):
 
 
 @dataclass(frozen=True)
-class Eval(_RunCommand):
+class Eval(_PictureCommand):
     """Measure a run on its held-out views."""
 
     output_path: Path = Path("eval.json")
@@ -84,12 +91,12 @@ class Eval(_RunCommand):
     def run(self) -> None:
         from edge_se_sampler.engine.evaluation import evaluate_run
 
-        results = evaluate_run(*self._load(), self.output_path, self.render_output_path)
+        results = evaluate_run(self._load_all(), self.output_path, self.render_output_path)
         print(f"PSNR {results['psnr']:.2f} dB over {results['num_images']} views; see {self.output_path}")
 
 
 @dataclass(frozen=True)
-class Render(_RunCommand):
+class Render(_PictureCommand):
     """Render a run as a video, or as a folder of frames."""
 
     output_path: Path = Path("render.gif")
@@ -117,7 +124,8 @@ class Render(_RunCommand):
     def run(self) -> None:
         from edge_se_sampler.engine.video import render_run
 
-        render_run(*self._load(), **{key: value for key, value in vars(self).items() if key != "run_folder"})
+        options = {key: value for key, value in vars(self).items() if key not in ("run_folder", "average_with")}
+        render_run(self._load_all(), **options)
         print(self.output_path)
 
 
@@ -155,6 +163,14 @@ class View(ViewerConfig, _RunCommand):
 
             write_html(*self._load(), self.html)
             print(self.html)
+
+
+def load_run(folder: Path) -> tuple[RunFolder, TrainerConfig]:
+    """A run's folder and its config; InputError if there is none."""
+    from edge_se_sampler.engine.run_folder import RunFolder
+
+    run = RunFolder(folder)
+    return run, run.config(method_configs())
 
 
 def train(trainer: Any) -> None:

@@ -51,6 +51,33 @@ def test_eval_writes_valid_json_with_nerfstudios_keys(run: Path, tmp_path: Path,
     assert -10 * np.log10(((truth - rendered) ** 2).mean()) == pytest.approx(results["psnr"], abs=0.1)
 
 
+@pytest.fixture
+def other_run(run: Path, scene: Path, tmp_path: Path, edge_se) -> Path:
+    """A run on the same scene, with another seed."""
+    flags = ["--data", scene, "--output-dir", tmp_path / "other", "--experiment-name", "scene", "--machine.seed", 1]
+    assert edge_se("train", "vanilla-nerf", *flags, *SMALL).code == 0
+    return next((tmp_path / "other" / "scene" / "vanilla-nerf").iterdir())
+
+
+def test_eval_and_render_average_runs(run: Path, other_run: Path, tmp_path: Path, edge_se):
+    measured = {}
+    for name, runs in {"one": [run], "other": [other_run], "both": [run, "--average-with", other_run]}.items():
+        flags = ["--output-path", tmp_path / f"{name}.json", "--render-output-path", tmp_path / name]
+        assert edge_se("eval", *runs, *flags).code == 0
+        measured[name] = iio.imread(tmp_path / name / "0000.png")[:, 24:].astype(float)
+    assert np.abs(measured["one"] - measured["other"]).max() > 10
+    np.testing.assert_allclose(measured["both"], (measured["one"] + measured["other"]) / 2, atol=1.01)
+    content = json.loads((tmp_path / "both.json").read_text())
+    assert [Path(path).parents[1] for path in (content["checkpoint"], *content["averaged_with"])] == [run, other_run]
+
+    folder = tmp_path / "frames"
+    flags = ["--output-path", folder, "--kind", "test"]
+    assert edge_se("render", run, *flags, "--average-with", other_run).code == 0
+    frame = iio.imread(folder / "rgb" / "00000.png").astype(float)
+    np.testing.assert_allclose(frame, measured["both"], atol=1.01)
+    assert "checkpoint" in edge_se("render", run, *flags).err  # these frames are of both runs
+
+
 def test_render_gif(run: Path, tmp_path: Path, edge_se):
     path = tmp_path / "turn.gif"
     assert edge_se("render", run, "--output-path", path, "--num-frames", 3, "--outputs", "rgb", "depth").code == 0

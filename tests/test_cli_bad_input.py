@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -230,6 +231,24 @@ class TestRuns:
         change(config)
         (run / "config.json").write_text(json.dumps(config))
         assert named in refused(edge_se, run, "eval", run)
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (lambda c: c.update(data="/elsewhere"), "data"),
+            (lambda c: c.update(eval_every=3), "eval_every"),
+            (lambda c: c["pipeline"]["model"].update(background_color="black"), "background_color"),
+        ],
+    )
+    def test_of_another_scene_for_the_mean(self, run: Path, tmp_path: Path, edge_se, change, named: str):
+        other = Path(shutil.copytree(run, tmp_path / "other"))
+        config = json.loads((other / "config.json").read_text())
+        change(config)
+        (other / "config.json").write_text(json.dumps({**config, "checksum": None}))
+        for command in ("eval", "render"):
+            line = refused(edge_se, run, command, run, "--average-with", other)
+            assert named in line
+            assert str(other) in line
 
     def test_with_data_that_is_gone(self, run: Path, scene: Path, edge_se):
         scene.rename(scene.with_name("moved"))

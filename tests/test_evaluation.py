@@ -19,6 +19,7 @@ from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.rendering import Picture, measure_psnr, render_rays, render_view, to_pictures
 from edge_se_sampler.models import nerf as model_module
+from edge_se_sampler.models.ensemble import Ensemble
 from edge_se_sampler.models.nerf import NeRFModel
 
 HEIGHT, WIDTH = 20, 24
@@ -182,3 +183,13 @@ def test_a_diverged_model_raises_instead_of_returning_nan() -> None:
         model.fine.density.bias.fill_(1)
     with pytest.raises(FloatingPointError, match="not finite"):
         evaluate(model, to_pictures(tiny_views(1, 4, 4)))
+
+
+def test_an_ensemble_renders_the_mean_of_its_members() -> None:
+    members = [with_constant_density(model_of(), raw) for raw in (0.5, 2.0, -1.0)]
+    ensemble, picture = Ensemble(members), to_pictures(tiny_views(1, HEIGHT, WIDTH))[0]
+    rays = picture.rays(ensemble.device)
+    for key in ("rgb_fine", "accumulation_fine", "depth_fine", "background"):
+        each = torch.stack([render_rays(member, rays, key) for member in members])
+        torch.testing.assert_close(render_rays(ensemble, rays, key), each.mean(dim=0))
+        assert (each.std(dim=0).min() > 0.01) == (key != "background")

@@ -75,7 +75,7 @@ def render(folders: Folders, out: Path, rng: random.Random) -> None:
 
     def use(paths: Path) -> None:
         path, dataparser = paths / "camera_path.json", paths / "dataparser_transforms.json"
-        Render(run, out / name, outputs, camera_path=path, dataparser_transforms=dataparser).run()
+        Render(run, output_path=out / name, outputs=outputs, camera_path=path, dataparser_transforms=dataparser).run()
 
     folders.path(rng, use)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from edge_se_sampler.engine.metrics import composite_on, compute_metrics, psnr
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import Picture, render_view, to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import load_model, read_test_views
+from edge_se_sampler.engine.session import load_ensemble, read_test_views
 from edge_se_sampler.models.ray_model import RayModel
 
 
@@ -43,11 +43,13 @@ def evaluate(
 
 
 def evaluate_run(
-    run: RunFolder, config: TrainerConfig, output_path: Path, render_output_path: Path | None
+    runs: Sequence[tuple[RunFolder, TrainerConfig]], output_path: Path, render_output_path: Path | None
 ) -> dict[str, Any]:
-    """Evaluate a run's last checkpoint on its held-out views, and write a json with the keys of nerfstudio's eval."""
+    """Evaluate the last checkpoint of a run, or of several in the mean, on the first one's held-out views, and write a
+    json with the keys of nerfstudio's eval."""
     check_output(output_path)
-    model, checkpoint = load_model(run, config)
+    model, checkpoints = load_ensemble(runs)
+    config = runs[0][1]
     pictures = to_pictures(read_test_views(config))
     if render_output_path is not None:
         make_folder(render_output_path, "--render-output-path")
@@ -61,5 +63,6 @@ def evaluate_run(
     with Progress(len(pictures), "evaluating") as progress:
         results = evaluate(model, pictures, report)
     names = {"experiment_name": config.experiment_name, "method_name": config.method_name}
-    write_json(output_path, names | {"checkpoint": str(checkpoint), "results": results})
+    others = {"averaged_with": [str(path) for path in checkpoints[1:]]} if len(checkpoints) > 1 else {}
+    write_json(output_path, names | {"checkpoint": str(checkpoints[0]), **others, "results": results})
     return results

@@ -79,14 +79,17 @@ def choose_depth_unit(far: float, unit: float | None) -> float:
 
 
 def write_frames(
-    folder: Path, model: RayModel, cameras: Cameras, outputs: Sequence[str], depth_unit: float, checkpoint: Path
+    folder: Path,
+    model: RayModel,
+    cameras: Cameras,
+    outputs: Sequence[str],
+    depth_unit: float,
+    checkpoints: Sequence[Path],
 ) -> None:
     """Write FOLDER/OUTPUT/00000.png, ... of all cameras, and frames.json, which says what they are. What is there and
-    whole is kept. InputError if the folder has other things, or frames of another checkpoint, cameras or unit."""
-    with open(checkpoint, "rb") as file:
-        digest = file.readline().split()[-1].decode()  # every checkpoint begins with its own
+    whole is kept. InputError if the folder has other things, or frames of other checkpoints, cameras or units."""
     facts = {
-        "checkpoint": f"{checkpoint.stem}, sha256 {digest}",
+        "checkpoint": "; ".join(map(_name_checkpoint, checkpoints)),
         "depth_unit": depth_unit,
         "depth": "raw-depth: value * depth_unit is the depth along the optical axis in the data's units, 0 is nothing",
         "frames": [_describe(cameras, i) for i in range(len(cameras))],
@@ -103,6 +106,11 @@ def write_frames(
                 write_image(frames[i][name], image)
             done += 1
             progress.update(done)
+
+
+def _name_checkpoint(path: Path) -> str:
+    with open(path, "rb") as file:
+        return f"{path.stem}, sha256 {file.readline().split()[-1].decode()}"  # every checkpoint begins with its own
 
 
 def _describe(cameras: Cameras, index: int) -> dict[str, Any]:

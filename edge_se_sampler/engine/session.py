@@ -30,6 +30,7 @@ from edge_se_sampler.engine.saved_state import check_parts
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig, apply_preset, decide_size
+from edge_se_sampler.models.ensemble import Ensemble
 from edge_se_sampler.models.lean import compile_ops
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
@@ -133,6 +134,24 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
     load_weights(model, state["model"])
     return model, checkpoint
+
+
+def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayModel, list[Path]]:
+    """A run's model, or what several runs on the same data render in the mean, and their last checkpoints; InputError
+    if one is bad, or of another scene, or has seen what another has not."""
+    run, config = runs[0]
+    for other, found in runs[1:]:
+        for name, value, expected in (
+            ("data", found.data, config.data),
+            ("eval_every", found.eval_every, config.eval_every),
+            ("background_color", found.pipeline.model.background_color, config.pipeline.model.background_color),
+        ):
+            if value != expected:
+                raise InputError(
+                    f"{other.path}: {name} is {value}, but {expected} in {run.path}; average runs alike in it"
+                )
+    models, checkpoints = zip(*(load_model(*each) for each in runs), strict=True)
+    return models[0] if len(models) == 1 else Ensemble(models), list(checkpoints)
 
 
 def read_test_views(config: TrainerConfig) -> Views:

@@ -21,7 +21,7 @@ from edge_se_sampler.engine.files import check_output, write_atomically
 from edge_se_sampler.engine.frames import FRAMES_ONLY, choose_depth_unit, render_frame, write_frames
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.session import load_model, read_test_views, read_train_views
+from edge_se_sampler.engine.session import load_ensemble, read_test_views, read_train_views
 from edge_se_sampler.engine.trajectories import spiral, through
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.ray_model import RayModel
@@ -30,8 +30,7 @@ FRAMES_PER_SECOND = 20
 
 
 def render_run(
-    run: RunFolder,
-    config: TrainerConfig,
+    runs: Sequence[tuple[RunFolder, TrainerConfig]],
     output_path: Path,
     outputs: Sequence[str],
     *,
@@ -42,8 +41,10 @@ def render_run(
     frames_per_second: float | None = None,
     depth_unit: float | None = None,
 ) -> None:
-    """Render a run's last checkpoint at the cameras of a kind (see `find_cameras`) or of a camera path file, as a video
-    of the outputs (see `render_frame`) side by side, or as a folder of frames. InputError for what cannot be used."""
+    """Render the last checkpoint of a run, or of several in the mean, at the cameras of a kind (see `find_cameras`) or
+    of a camera path file, as a video of the outputs (see `render_frame`) side by side, or as a folder of frames.
+    InputError for what cannot be used."""
+    config = runs[0][1]
     if kind is not None and camera_path is not None:
         raise InputError("--kind and --camera-path: give one of them")
     if dataparser_transforms is not None and camera_path is None:
@@ -59,12 +60,12 @@ def render_run(
     if output_path.suffix:
         check_video(output_path, outputs, rate)
     unit = choose_depth_unit(config.pipeline.model.depths[1], depth_unit)
-    model, checkpoint = load_model(run, config)
+    model, checkpoints = load_ensemble(runs)
     cameras = find_cameras(config, kind or "spiral", num_frames) if path is None else path.cameras
     if output_path.suffix:
         write_video(output_path, _video_frames(model, cameras, outputs, unit), rate)
     else:
-        write_frames(output_path, model, cameras, outputs, unit, checkpoint)
+        write_frames(output_path, model, cameras, outputs, unit, checkpoints)
 
 
 def find_cameras(config: TrainerConfig, kind: str, num_frames: int) -> Cameras:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from edge_se_sampler.bench.runner import Run, run_in_subprocess
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.scene_file import quote
-from edge_se_sampler.engine.config import MODEL, SAMPLER, override
+from edge_se_sampler.engine.config import MODEL, SAMPLER, TrainerConfig, override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.rendering import to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.models.ensemble import Ensemble
+from edge_se_sampler.models.lean import LeanModel
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "lean-nerf": {},
@@ -39,8 +41,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
         f"{MODEL}.transmittance_threshold": 0.003,
     },
     "half the memory": {f"{MODEL}.max_memory": 0.5},
+    "mean of three trainings": {},
 }
 """What is changed, by label."""
+MEMBERS = {"mean of three trainings": 3}
+"""Variants that are so many trainings, each with its share of the budget and a seed of its own."""
+SEEDS_APART = 1000
+"""How far apart the seeds of such trainings are."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +70,16 @@ class Trial:
     seed: int
 
 
-def training_length(budget: str) -> dict[str, Any]:
-    """A time budget, or a number of steps, as changes of a training's config; InputError if the number is none."""
+def training_length(budget: str, members: int = 1) -> dict[str, Any]:
+    """A time budget, or a number of steps, or a share of it, as changes of a training's config; InputError if it is
+    none."""
     if is_time(budget):
-        return {"time_budget": budget}
+        seconds = replace(method_configs()["lean-nerf"], time_budget=budget).budget_seconds
+        return {"time_budget": budget if members == 1 or seconds is None else f"{seconds / members:g}"}
     steps = budget.removesuffix(STEPS)
     valid = steps.isdecimal() and int(steps) > 0
     check_value("budgets", quote(budget), valid, 'a time, as 90s or 10m, or a number of steps, as "2000 steps"')
-    return {"max_num_iterations": int(steps)}
+    return {"max_num_iterations": max(1, int(steps) // members)}
 
 
 def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
@@ -86,22 +95,14 @@ def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -
 
 
 def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
-    changes = {
-        "data": scenes / trial.scene,
-        "downscale": trial.downscale,
-        **training_length(trial.budget),
-        "output_dir": workplace / "runs",
-        "machine.seed": trial.seed,
-        **VARIANTS[trial.variant],
-    }
+    start = time.process_time()
     with contextlib.redirect_stderr(io.StringIO()):
-        trainer = prepare(override(method_configs()["lean-nerf"], changes))
-        start = time.process_time()
-        trainer.train()
+        trained = [_train(trial, member, scenes, workplace) for member in range(MEMBERS.get(trial.variant, 1))]
     cpu_seconds = time.process_time() - start
     peak = resident_memory("VmHWM")
-    model, config = trainer.pipeline.model, trainer.config
-    pictures = to_pictures(read_test_views(config))
+    models = [member.model for member in trained]
+    model = models[0] if len(models) == 1 else Ensemble(models)
+    pictures = to_pictures(read_test_views(trained[0].config))
     start = time.monotonic()
     results = evaluate(model, pictures)
     seconds_per_view = (time.monotonic() - start) / len(pictures)
@@ -111,14 +112,39 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
         "ssim": round(results["ssim"], 4),
         "val_psnr": _mean_psnr(model, trial, scenes, "val"),
         "train_psnr": _mean_psnr(model, trial, scenes, "train", settings.num_train_views),
-        "steps": trainer.next_step,
-        "seconds": round(trainer.elapsed + trainer.setup_seconds, 2),
+        "steps": sum(member.steps for member in trained),
+        "seconds": round(sum(member.seconds for member in trained), 2),
         "cpu_seconds": round(cpu_seconds, 2),
-        "level": int(model.grid.level),
-        "rows": model.grid.num_rows,
+        "level": max(int(model.grid.level) for model in models),
+        "rows": sum(model.grid.num_rows for model in models),
         "memory": round(peak / 2**30, 2),
         "seconds_per_view": round(seconds_per_view, 3),
     }
+
+
+class _Trained(NamedTuple):
+    """What is left of a training: not its optimizer, which takes more memory than the model."""
+
+    model: LeanModel
+    config: TrainerConfig
+    steps: int
+    seconds: float
+
+
+def _train(trial: Trial, member: int, scenes: Path, workplace: Path) -> _Trained:
+    """A trial's training, or one of several: member 0, 1, ..."""
+    changes = {
+        "data": scenes / trial.scene,
+        "downscale": trial.downscale,
+        **training_length(trial.budget, MEMBERS.get(trial.variant, 1)),
+        "output_dir": workplace / "runs",
+        "machine.seed": trial.seed + SEEDS_APART * member,
+        **VARIANTS[trial.variant],
+    }
+    trainer = prepare(override(method_configs()["lean-nerf"], changes))
+    trainer.train()
+    seconds = trainer.elapsed + trainer.setup_seconds
+    return _Trained(trainer.pipeline.model, trainer.config, trainer.next_step, seconds)
 
 
 def _mean_psnr(model: Any, trial: Trial, scenes: Path, split: Split, count: int | None = None) -> float | None:

@@ -1,0 +1,33 @@
+"""Several trained models of a scene as one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.models.ray_model import RayModel
+
+
+class Ensemble(RayModel):
+    """Renders the mean of what its members render, which were trained on the same scene with other seeds: their errors
+    differ, and cancel in part (deep ensembles, Lakshminarayanan et al. 2017). Its config is the first one's."""
+
+    def __init__(self, members: Sequence[RayModel]) -> None:
+        super().__init__(members[0].config, members[0].grid)
+        self.members = nn.ModuleList(members)
+
+    @property
+    def rays_per_chunk(self) -> int:
+        return min(member.rays_per_chunk for member in self._models())
+
+    def forward(self, rays: RayBundle) -> dict[str, Tensor]:
+        """As `RayModel`; of networks that all members have."""
+        outputs = [member(rays) for member in self._models()]
+        common = set.intersection(*(set(rendered) for rendered in outputs))
+        return {key: torch.stack([rendered[key] for rendered in outputs]).mean(dim=0) for key in sorted(common)}
+
+    def _models(self) -> list[RayModel]:
+        return [member for member in self.members if isinstance(member, RayModel)]  # what a type checker can tell
