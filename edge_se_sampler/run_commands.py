@@ -55,8 +55,8 @@ class _RunCommand:
 @dataclass(frozen=True)
 class _PictureCommand(_RunCommand):
     average_with: tuple[Path, ...] = ()
-    """More runs on the same data, with other seeds: pictures are the mean of what all of them render, which is better
-    than any, and takes as much longer."""
+    """More runs on the same data, with other seeds: pictures are the mean of what all of them render, which takes as
+    much longer. What they get wrong differs, and cancels in part."""
 
     def _load_all(self) -> list[tuple[RunFolder, TrainerConfig]]:
         return [load_run(folder) for folder in (self.run_folder, *self.average_with)]

@@ -20,6 +20,7 @@ from edge_se_sampler.bench.strategies.summary import (
     Panel,
     best_at_equal_seconds,
     compare,
+    panels_of,
     cost_of_a_step,
     count_failures,
 )
@@ -180,7 +181,7 @@ def folder_of(folder: Path, runs: list[dict[str, Any]], errors: tuple[dict[str, 
     return folder
 
 
-PANEL = Panel("lean", 4, "centered")
+PANEL = Panel("lean", (200, 200), "centered")
 
 
 FAILED = {"uniform": [("lego", 1), ("chair", 0)], "edge": [("lego", 1), ("lego", 2)], "se-cached": []}
@@ -280,6 +281,14 @@ def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
     less = [run for run in runs if run["downscale"] >= 8]
     assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable in 1 of 2"
     assert describe_use(less, "se") == "–"
+
+
+def test_images_of_another_size_are_compared_apart() -> None:
+    fox = {"scene": "fox", "size": [135, 240], "downscale": 4}
+    runs = [run_of(20.0, 0), run_of(24.0, 0, "edge"), run_of(10.0, 0, **fox), run_of(9.0, 0, "edge", **fox)]
+    assert [panel.size for panel in panels_of(runs)] == [(135, 240), (200, 200)]
+    found = [compare(runs, panel, "edge", "seconds") for panel in panels_of(runs)]
+    assert [comparison and comparison.differences["psnr"] for comparison in found] == [-1.0, 4.0]
 
 
 def test_a_capture_counts_where_it_has_a_number(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def labels_of(runs: list[Run]) -> dict[Panel, str]:
     """Panel -> its model, the size of its images, and whether they are centered."""
     labels = {}
     for panel in panels_of(runs):
-        width, height = next(run["size"] for run in runs if Panel.of(run) == panel)
+        width, height = panel.size
         size = f"{width} px" if width == height else f"{width} x {height} px"
         labels[panel] = f"{panel.model}, {size}" + (", off center" if panel.placement == "shifted" else "")
     return labels

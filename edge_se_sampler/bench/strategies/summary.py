@@ -8,6 +8,7 @@ seeds that did not fail: failures are counted, and would drown all else.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -26,12 +27,13 @@ class Panel:
     """What is compared among itself."""
 
     model: str
-    downscale: int
+    size: tuple[int, int]
+    """Width and height of the images in pixels: captures are apart from NeRF's scenes."""
     placement: str
 
     @classmethod
     def of(cls, run: Run) -> Panel:
-        return cls(run["model"], run["downscale"], run["placement"])
+        return cls(run["model"], (run["size"][0], run["size"][1]), run["placement"])
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def panels_of(runs: Iterable[Run]) -> list[Panel]:
     """Models in the order of `ALL_MODELS`, small before large, centered before shifted."""
 
     def order(panel: Panel) -> tuple[Any, ...]:
-        return ALL_MODELS.index(panel.model), -panel.downscale, PLACEMENTS.index(panel.placement)
+        return ALL_MODELS.index(panel.model), math.prod(panel.size), PLACEMENTS.index(panel.placement)
 
     return sorted({Panel.of(run) for run in runs}, key=order)
 
