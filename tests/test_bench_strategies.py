@@ -20,9 +20,9 @@ from edge_se_sampler.bench.strategies.summary import (
     Panel,
     best_at_equal_seconds,
     compare,
-    panels_of,
     cost_of_a_step,
     count_failures,
+    panels_of,
 )
 from edge_se_sampler.bench.strategies.train import build_config, run_trial, without_alpha
 from edge_se_sampler.bench.strategies.trials import (
