@@ -137,8 +137,8 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
 
 
 def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayModel, list[Path]]:
-    """A run's model, or what several runs on the same data render in the mean, and their last checkpoints; InputError
-    if one is bad, or of another scene, or has seen what another has not."""
+    """A run's model, or that of several runs, which renders the mean of theirs, and their last checkpoints; InputError
+    if one is bad, or their data, held-out views or backgrounds differ."""
     run, config = runs[0]
     for other, found in runs[1:]:
         for name, value, expected in (
@@ -148,7 +148,7 @@ def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayM
         ):
             if value != expected:
                 raise InputError(
-                    f"{other.path}: {name} is {value}, but {expected} in {run.path}; average runs alike in it"
+                    f"{other.path}: {name} is {value}, but {expected} in {run.path}; average runs that agree in it"
                 )
     models, checkpoints = zip(*(load_model(*each) for each in runs), strict=True)
     return models[0] if len(models) == 1 else Ensemble(models), list(checkpoints)
