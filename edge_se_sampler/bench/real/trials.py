@@ -95,10 +95,8 @@ def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -
 
 
 def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
-    start = time.process_time()
     with contextlib.redirect_stderr(io.StringIO()):
         trained = [_train(trial, member, scenes, workplace) for member in range(MEMBERS.get(trial.variant, 1))]
-    cpu_seconds = time.process_time() - start
     peak = resident_memory("VmHWM")
     models = [member.model for member in trained]
     model = models[0] if len(models) == 1 else Ensemble(models)
@@ -114,7 +112,7 @@ def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Se
         "train_psnr": _mean_psnr(model, trial, scenes, "train", settings.num_train_views),
         "steps": sum(member.steps for member in trained),
         "seconds": round(sum(member.seconds for member in trained), 2),
-        "cpu_seconds": round(cpu_seconds, 2),
+        "cpu_seconds": round(sum(member.cpu_seconds for member in trained), 2),
         "level": max(int(model.grid.level) for model in models),
         "rows": sum(model.grid.num_rows for model in models),
         "memory": round(peak / 2**30, 2),
@@ -129,6 +127,7 @@ class _Trained(NamedTuple):
     config: TrainerConfig
     steps: int
     seconds: float
+    cpu_seconds: float
 
 
 def _train(trial: Trial, member: int, scenes: Path, workplace: Path) -> _Trained:
@@ -142,9 +141,10 @@ def _train(trial: Trial, member: int, scenes: Path, workplace: Path) -> _Trained
         **VARIANTS[trial.variant],
     }
     trainer = prepare(override(method_configs()["lean-nerf"], changes))
+    start = time.process_time()
     trainer.train()
-    seconds = trainer.elapsed + trainer.setup_seconds
-    return _Trained(trainer.pipeline.model, trainer.config, trainer.next_step, seconds)
+    cpu_seconds, seconds = time.process_time() - start, trainer.elapsed + trainer.setup_seconds
+    return _Trained(trainer.pipeline.model, trainer.config, trainer.next_step, seconds, cpu_seconds)
 
 
 def _mean_psnr(model: Any, trial: Trial, scenes: Path, split: Split, count: int | None = None) -> float | None:
