@@ -137,8 +137,8 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
 
 
 def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayModel, list[Path]]:
-    """A run's model, or that of several runs, which renders the mean of theirs, and their last checkpoints; InputError
-    if one is bad, or their data, held-out views or backgrounds differ."""
+    """The model of one run, or an ensemble of the models of several, and the last checkpoint of each run; InputError if
+    a run is bad, or the runs' data, held-out views or background colors differ."""
     run, config = runs[0]
     for other, found in runs[1:]:
         for name, value, expected in (

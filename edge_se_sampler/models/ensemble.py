@@ -12,8 +12,8 @@ from edge_se_sampler.models.ray_model import RayModel
 
 
 class Ensemble(RayModel):
-    """Renders the mean of what its members render, which were trained on the same scene with other seeds: their errors
-    differ, and cancel in part (deep ensembles, Lakshminarayanan et al. 2017). Its config is the first one's."""
+    """Renders the mean of the outputs of its members, models trained on the same scene with different seeds, whose errors
+    cancel in part (deep ensembles, Lakshminarayanan et al. 2017). Its config is the first member's."""
 
     def __init__(self, members: Sequence[RayModel]) -> None:
         super().__init__(members[0].config, members[0].grid)
@@ -24,7 +24,7 @@ class Ensemble(RayModel):
         return min(member.rays_per_chunk for member in self._models())
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
-        """As `RayModel`; of networks that all members have."""
+        """As `RayModel`, for the networks that all members have."""
         outputs = [member(rays) for member in self._models()]
         common = set.intersection(*(set(rendered) for rendered in outputs))
         return {key: torch.stack([rendered[key] for rendered in outputs]).mean(dim=0) for key in sorted(common)}
