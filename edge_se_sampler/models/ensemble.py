@@ -12,7 +12,7 @@ from edge_se_sampler.models.ray_model import RayModel
 
 
 class Ensemble(RayModel):
-    """Renders the mean of the outputs of its members, models trained on the same scene with different seeds, whose errors
+    """Renders the mean of the outputs of its members, models trained on the same scene with other seeds, whose errors
     cancel in part (deep ensembles, Lakshminarayanan et al. 2017). Its config is the first member's."""
 
     def __init__(self, members: Sequence[RayModel]) -> None:
