@@ -37,7 +37,7 @@ def _nerf(name: str, model: NeRFModelConfig, early: str, late: str, description:
 
 def lean_nerf() -> MethodSpecification:
     """The method that is recommended."""
-    sampler = EdgeSEPixelSamplerConfig(early="uniform", late="uniform", images_per_step="all")
+    sampler = EdgeSEPixelSamplerConfig(early="expansive", late="expansive", images_per_step="all")
     manager = VanillaDataManagerConfig(skip_empty_rays=True, pixel_sampler=sampler)
     adam = OptimizerConfig(eps=1e-15, beta2=0.99, warmup_steps=20, fused=True)
     config = TrainerConfig(

@@ -79,13 +79,15 @@ def _nerfacto() -> MethodSpecification:
 
 
 def _lean_nerf() -> MethodSpecification:
-    """The standalone program's method, with its settings for images of more than 256 pixels."""
+    """The standalone program's method, with its settings for images of more than 256 pixels, and uniform pixels, for
+    nerfstudio's losses take no weights."""
     standalone, preset = lean_nerf(), LEAN_PRESETS["paper"]
     parts, adam = standalone.config.pipeline, replace(standalone.config.optimizer, lr=preset.learning_rate)
+    no_weights = {"early": "uniform", "late": "uniform", "soft_mining_alpha": 0.0}
     manager = LeanDataManagerConfig(
         dataparser=NerfstudioDataParserConfig(),
         train_num_rays_per_batch=preset.rays,
-        pixel_sampler=EdgeSEPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler) | {"soft_mining_alpha": 0.0}),
+        pixel_sampler=EdgeSEPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler) | no_weights),
     )
     config = TrainerConfig(
         method_name="lean-nerf",

@@ -14,6 +14,7 @@ RECOMMENDED = "lean"
 TOP = ("methods", "errors")
 """Groups that the picture of all methods shows; the others change parts of the recommended one."""
 
+UNIFORM_PIXELS = {f"{SAMPLER}.early": "uniform", f"{SAMPLER}.late": "uniform"}
 CACHED_ERRORS = {f"{SAMPLER}.error_source": "cached"}
 ADAPTIVE = {f"{SAMPLER}.schedule": "adaptive"}
 IN_THE_HULL = {
@@ -50,8 +51,13 @@ VARIANTS: dict[str, Variant] = {
     ),
     "edge-se-cached": Variant("errors", "Edge + SE (cached errors)", CACHED_ERRORS, "edge-se-nerf"),
     "edge-se-adaptive": Variant("errors", "Edge + SE (adaptive schedule)", ADAPTIVE, "edge-se-nerf"),
-    "lean-errors": Variant("pixels", "by cached squared errors", {f"{SAMPLER}.late": "se", **CACHED_ERRORS}),
-    "lean-edge": Variant("pixels", "Edge first (adaptive schedule)", {f"{SAMPLER}.early": "edge", **ADAPTIVE}),
+    "lean-uniform": Variant("pixels", "uniformly", UNIFORM_PIXELS),
+    "lean-errors": Variant(
+        "pixels", "by cached squared errors", {**UNIFORM_PIXELS, f"{SAMPLER}.late": "se", **CACHED_ERRORS}
+    ),
+    "lean-edge": Variant(
+        "pixels", "Edge first (adaptive schedule)", {**UNIFORM_PIXELS, f"{SAMPLER}.early": "edge", **ADAPTIVE}
+    ),
     "no-hull": Variant("parts", "no hull", {f"{MODEL}.cull_by_alpha": False}),
     "no-alpha-loss": Variant("parts", "no alpha loss", {f"{MODEL}.alpha_loss": 0.0}),
     "two-networks": Variant("parts", "vanilla-nerf's two networks in the hull", IN_THE_HULL, "vanilla-nerf"),

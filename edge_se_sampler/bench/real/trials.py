@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from edge_se_sampler.bench.chart.variants import UNIFORM_PIXELS
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.real.summary import STEPS, is_time
 from edge_se_sampler.bench.runner import Run, run_in_subprocess
@@ -28,7 +29,8 @@ from edge_se_sampler.models.lean import LeanModel
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "lean-nerf": {},
-    "pixels by cached errors": {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"},
+    "uniform pixels": UNIFORM_PIXELS,
+    "pixels by cached errors": {**UNIFORM_PIXELS, f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"},
     "one ray a pixel": {f"{MODEL}.supersample": False},
     "no hull": {f"{MODEL}.cull_by_alpha": False},
     "rays from near on": {f"{MODEL}.near_share": 0.0},
