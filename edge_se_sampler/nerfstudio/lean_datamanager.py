@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from edge_se_sampler.nerfstudio.datamanager import EdgeSEDataManager, EdgeSEDataManagerConfig
+from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSamplerConfig
 from edge_se_sampler.nerfstudio.training_images import TrainingImages
 
 
@@ -51,7 +52,16 @@ def _add_masks(batch: dict[str, Any], hit_pixels: list[np.ndarray]) -> None:
 
 
 @dataclass
+class LeanPixelSamplerConfig(EdgeSEPixelSamplerConfig):
+    """The pixel sampler of lean-nerf, whose loss takes weights."""
+
+    loss_takes_weights: ClassVar[bool] = True
+
+
+@dataclass
 class LeanDataManagerConfig(EdgeSEDataManagerConfig):
     """The data manager of lean-nerf."""
 
     _target: type = field(default_factory=lambda: LeanDataManager)
+    pixel_sampler: LeanPixelSamplerConfig = field(default_factory=LeanPixelSamplerConfig)
+    """Which pixels are trained on."""

@@ -88,12 +88,14 @@ class LeanNerfModel(Model):
         return {"rgb": rgb, "accumulation": opacity, "depth": torch.where(opacity > 0.5, depth, far)}
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:
-        """The loss of `LeanModel`: of colors, and of opacity where images have alpha."""
+        """The loss of `LeanModel`: of colors, and of opacity where images have alpha; weighted if the batch is."""
         if self.training:
             self.field.remember(outputs["rendered"])
         names = {f"{name}_fine": outputs[name] for name in ("rgb", "accumulation")}
-        image = unit_interval(batch["image"].to(self.device))
-        loss, _ = self.field.loss(names | {"background": self._background(outputs["rgb"])}, {"image": image})
+        pixels = {"image": unit_interval(batch["image"].to(self.device))}
+        if "weight" in batch:
+            pixels["weight"] = batch["weight"].to(self.device)
+        loss, _ = self.field.loss(names | {"background": self._background(outputs["rgb"])}, pixels)
         return {"loss": loss.mean()}
 
     def get_metrics_dict(self, outputs: Any, batch: Any) -> dict[str, Tensor]:

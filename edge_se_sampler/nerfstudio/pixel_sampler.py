@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 
@@ -34,6 +34,8 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
     first, a pixel in it second."""
     soft_mining_alpha: float = 0.0
     """Loss weights of Soft Mining: none, for nerfstudio's losses take no weights."""
+    loss_takes_weights: ClassVar[bool] = False
+    """Whether the model's loss takes the batch's weights."""
 
     def rules(self) -> list[tuple[str, bool, str]]:
         """Those of every host, and nerfstudio's."""
@@ -42,10 +44,13 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
         not_alone = "nerfstudio's models render coarse colors only together with the fine ones; take fine or cached"
         return [
             *super().rules(),
-            ("importance_weight", not self.importance_weight, no_weights),
-            ("soft_mining_alpha", not self.soft_mining_alpha, no_weights),
+            ("importance_weight", self.loss_takes_weights or not self.importance_weight, no_weights),
+            ("soft_mining_alpha", self.loss_takes_weights or not self.soft_mining_alpha, no_weights),
             ("error_source", self.error_source != "coarse", not_alone),
-            *((phase, getattr(self, phase) != "expansive", needs_weights) for phase in ("early", "late")),
+            *(
+                (phase, self.loss_takes_weights or getattr(self, phase) != "expansive", needs_weights)
+                for phase in ("early", "late")
+            ),
         ]
 
     def check(self) -> None:

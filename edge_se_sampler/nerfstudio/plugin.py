@@ -25,7 +25,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from edge_se_sampler.methods import STRATEGIES, lean_nerf
 from edge_se_sampler.models.config import LEAN_PRESETS
 from edge_se_sampler.nerfstudio.datamanager import EdgeSEDataManagerConfig
-from edge_se_sampler.nerfstudio.lean_datamanager import LeanDataManagerConfig
+from edge_se_sampler.nerfstudio.lean_datamanager import LeanDataManagerConfig, LeanPixelSamplerConfig
 from edge_se_sampler.nerfstudio.lean_model import GROUP, LeanNerfModelConfig, RowAdamConfig
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSamplerConfig
 
@@ -79,15 +79,13 @@ def _nerfacto() -> MethodSpecification:
 
 
 def _lean_nerf() -> MethodSpecification:
-    """The standalone program's method, with its settings for images of more than 256 pixels, and uniform pixels, for
-    nerfstudio's losses take no weights."""
+    """The standalone program's method, with its settings for images of more than 256 pixels."""
     standalone, preset = lean_nerf(), LEAN_PRESETS["paper"]
     parts, adam = standalone.config.pipeline, replace(standalone.config.optimizer, lr=preset.learning_rate)
-    no_weights = {"early": "uniform", "late": "uniform", "soft_mining_alpha": 0.0}
     manager = LeanDataManagerConfig(
         dataparser=NerfstudioDataParserConfig(),
         train_num_rays_per_batch=preset.rays,
-        pixel_sampler=EdgeSEPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler) | no_weights),
+        pixel_sampler=LeanPixelSamplerConfig(**vars(parts.datamanager.pixel_sampler)),
     )
     config = TrainerConfig(
         method_name="lean-nerf",

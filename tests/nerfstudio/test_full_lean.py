@@ -92,8 +92,24 @@ def test_it_trains_on_alpha_and_on_pixels_that_see_a_cell(trained: Any) -> None:
     foreground, mask = batch["image"][..., 3] > 0, batch["mask"][..., 0]
     assert mask[foreground].float().mean() > 0.99
     assert 0.05 < mask.float().mean() < 0.9
-    assert manager.train_pixel_sampler.config.early == "uniform"
+    assert manager.train_pixel_sampler.config.early == "expansive"
     assert trained.pipeline.datamanager.eval_dataset[0]["image"].shape[-1] == 3
+
+
+def test_its_loss_takes_the_samplers_weights(scene: Path, tmp_path: Path) -> None:
+    trainer = trainer_of(lean_config(scene, tmp_path))
+    train(trainer, 2)
+    rays, batch = trainer.pipeline.datamanager.next_train(2)
+    assert len(batch["weight"].unique()) > 1
+    model = trainer.pipeline.model
+
+    def loss(weight: torch.Tensor) -> float:
+        return float(model.get_loss_dict(model(rays), batch | {"weight": weight})["loss"])
+
+    first = torch.zeros(len(batch["weight"]))
+    first[:10] = 1
+    assert 0 < loss(first) < loss(torch.ones_like(first))
+    assert loss(first) + loss(1 - first) == pytest.approx(loss(torch.ones_like(first)), rel=1e-4)
 
 
 @pytest.mark.parametrize("test_mode", ["test", "inference"])
