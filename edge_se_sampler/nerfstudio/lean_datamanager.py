@@ -14,6 +14,7 @@ from torch import Tensor
 from edge_se_sampler.nerfstudio.datamanager import EdgeSEDataManager, EdgeSEDataManagerConfig
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSamplerConfig
 from edge_se_sampler.nerfstudio.training_images import TrainingImages
+from edge_se_sampler.sampling.settings import SamplingSettings
 
 
 class LeanDataManager(EdgeSEDataManager):
@@ -56,6 +57,8 @@ class LeanPixelSamplerConfig(EdgeSEPixelSamplerConfig):
     """The pixel sampler of lean-nerf, whose loss takes weights."""
 
     loss_takes_weights: ClassVar[bool] = True
+    soft_mining_alpha: float = SamplingSettings.soft_mining_alpha
+    """Soft Mining weights the loss by this power of 1 / error; 0: not at all."""
 
 
 @dataclass

@@ -102,9 +102,10 @@ def test_its_loss_takes_the_samplers_weights(scene: Path, tmp_path: Path) -> Non
     rays, batch = trainer.pipeline.datamanager.next_train(2)
     assert len(batch["weight"].unique()) > 1
     model = trainer.pipeline.model
+    outputs = model(rays)
 
     def loss(weight: torch.Tensor) -> float:
-        return float(model.get_loss_dict(model(rays), batch | {"weight": weight})["loss"])
+        return float(model.get_loss_dict(outputs, batch | {"weight": weight})["loss"])
 
     first = torch.zeros(len(batch["weight"]))
     first[:10] = 1
@@ -200,7 +201,7 @@ def test_without_alpha_it_learns_where_the_object_is(scene: Path, tmp_path: Path
     model, sampler = trainer.pipeline.model, trainer.pipeline.datamanager.train_pixel_sampler
     near, far = model.field.config.depths
     assert 2 < near < 2.5 < 5.5 < far < 6.5  # the box reaches 1.5 from the origin, the cameras are 4 from it
-    assert sampler.strategy == "uniform"
+    assert sampler.strategy == "expansive"
     assert "mask" not in trainer.pipeline.datamanager.train_image_dataloader.cached_collated_batch
     trainer.train()
     assert psnr_of(trainer.pipeline) > 26
