@@ -117,6 +117,7 @@ def test_a_training_has_as_many_steps_as_its_budget(scenes: Path, tmp_path: Path
     assert run["steps"] == 3
 
 
+@pytest.mark.slow
 def test_several_trainings_share_a_budget_and_their_mean_is_measured(scenes: Path, tmp_path: Path) -> None:
     def train(steps: int, variant: str, seed: int) -> dict[str, Any]:
         trial = Trial("bricks", 1, f"{steps} steps", variant, seed)

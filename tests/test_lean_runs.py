@@ -121,7 +121,7 @@ def test_it_learns_in_a_moment_and_its_checkpoint_renders_without_the_images(lar
     model = trainer.pipeline.model
     views = trainer.pipeline.datamanager
     assert not bool(views.image_batch["mask"].all())  # only pixels whose rays hit the hull
-    assert views.train_pixel_sampler.config.late == "uniform"
+    assert views.train_pixel_sampler.config.late == "expansive"
     trainer.train()
     picture = to_pictures(read_blender(larger, "test"))[0]
     psnr = measure_psnr(render_view(model, picture), picture, 1.0)

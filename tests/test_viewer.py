@@ -159,7 +159,7 @@ def test_the_drawn_cells_are_the_occupied_ones_and_the_hull(viewed: Viewed) -> N
 
 
 def test_probabilities_are_those_of_the_current_strategy() -> None:
-    by_errors = {f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"}
+    by_errors = {f"{SAMPLER}.early": "uniform", f"{SAMPLER}.late": "se", f"{SAMPLER}.error_source": "cached"}
     viewed = Viewed(tiny_trainer(override(config_of(100), by_errors), VIEWS))
     sampler = viewed.trainer.pipeline.datamanager.train_pixel_sampler
     uniform = viewed.probability(0, lambda: None)
