@@ -66,5 +66,7 @@ class LeanDataManagerConfig(EdgeSEDataManagerConfig):
     """The data manager of lean-nerf."""
 
     _target: type = field(default_factory=lambda: LeanDataManager)
-    pixel_sampler: LeanPixelSamplerConfig = field(default_factory=LeanPixelSamplerConfig)
+    pixel_sampler: LeanPixelSamplerConfig = field(  # pyright: ignore[reportIncompatibleVariableOverride]
+        default_factory=LeanPixelSamplerConfig
+    )
     """Which pixels are trained on."""
