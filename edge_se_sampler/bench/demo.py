@@ -31,6 +31,7 @@ from edge_se_sampler.engine.trajectories import spiral
 from edge_se_sampler.engine.video import write_video
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.voxel_backend import compiled_ops
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
 
 SCENE: dict[str, Any] = {"name": "mic", "placement": "shifted", "offset": (0.2, 0.15), "size": 200}
 SPLITS: dict[str, Any] = {"num_train": 50, "num_val": 1, "num_test": 4}
@@ -38,7 +39,6 @@ ITERATIONS = 320
 TIME_BUDGET = "20"  # seconds, of lean-nerf
 METHODS = {"vanilla-nerf": "Random", "edge-se-nerf": "Edge + SE", "lean-nerf": "lean-nerf"}
 TURN = 48  # frames
-PIXELS = {"uniform": "uniform", "edge": "by edge strength", "se": "by squared error"}
 
 
 def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def _train(trainer: Trainer) -> tuple[dict[str, Any], np.ndarray]:
     results = evaluate(trainer.pipeline.model, pictures, lambda _, __, rendered: views.append(rendered))
     described = dict(line.split(maxsplit=1) for line in describe_run(trainer).splitlines())
     sampler: Any = trainer.pipeline.datamanager.config.pixel_sampler
-    early, late = PIXELS[sampler.early], PIXELS[sampler.late]
+    early, late = (PIXEL_STRATEGIES[name].description for name in (sampler.early, sampler.late))
     measured = {
         "model": described["model"],
         "pixels": late if early == late else f"{early} for {sampler.early_fraction:.0%} of the training, then {late}",
