@@ -42,15 +42,14 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
         no_weights = "nerfstudio's losses take no weights; leave it at 0, or train with edge-se"
         needs_weights = "weights the loss, and nerfstudio's losses take no weights; train with edge-se"
         not_alone = "nerfstudio's models render coarse colors only together with the fine ones; take fine or cached"
+        rules = [*super().rules(), ("error_source", self.error_source != "coarse", not_alone)]
+        if self.loss_takes_weights:
+            return rules
         return [
-            *super().rules(),
-            ("importance_weight", self.loss_takes_weights or not self.importance_weight, no_weights),
-            ("soft_mining_alpha", self.loss_takes_weights or not self.soft_mining_alpha, no_weights),
-            ("error_source", self.error_source != "coarse", not_alone),
-            *(
-                (phase, self.loss_takes_weights or getattr(self, phase) != "expansive", needs_weights)
-                for phase in ("early", "late")
-            ),
+            *rules,
+            ("importance_weight", not self.importance_weight, no_weights),
+            ("soft_mining_alpha", not self.soft_mining_alpha, no_weights),
+            *((phase, getattr(self, phase) != "expansive", needs_weights) for phase in ("early", "late")),
         ]
 
     def check(self) -> None:
