@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from capture_folder import HEIGHT, WIDTH, write_colmap
 
 from edge_se_sampler.bench.baselines.run import read_baselines
+from edge_se_sampler.bench.real import trials
 from edge_se_sampler.bench.real.command import BenchReal
 from edge_se_sampler.bench.real.figures import draw_chart
 from edge_se_sampler.bench.real.published import PUBLISHED
@@ -115,6 +117,27 @@ def test_a_budget_is_a_time_or_a_number_of_steps(budget: str, scenes: Path, tmp_
 def test_a_training_has_as_many_steps_as_its_budget(scenes: Path, tmp_path: Path) -> None:
     run = run_trial(Trial("bricks", 1, "3 steps", "lean-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
     assert run["steps"] == 3
+
+
+@pytest.mark.parametrize(("at_once", "threads"), [(1, 4), (2, 2), (9, 1)])
+def test_trainings_at_once_share_the_cores(
+    at_once: int, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Seen(Exception):
+        """Ends the training as it begins."""
+
+    def train(*_: Any) -> None:
+        raise Seen(torch.get_num_threads())
+
+    monkeypatch.setattr(trials, "_train", train)
+    monkeypatch.setattr(trials, "run_in_subprocess", lambda function, *arguments: function(*arguments))
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(4)
+        with pytest.raises(Seen, match=f"^{threads}$"):
+            trials.run_trial(Trial("bricks", 1, "1 steps", "lean-nerf", 0), tmp_path, tmp_path, Settings(), at_once)
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ class BenchReal(ExperimentCommand):
     """Time budgets, as in edge-se train, or numbers of steps ("2000 steps"), the same on any machine."""
     variants: tuple[str, ...] = ("lean-nerf",)
     """By their labels in the page; one thing is changed in each."""
+    workers: int | None = None
+    """Trainings at once, which share the cores; left out, one on all of them."""
 
     def experiment(self) -> Experiment:
         from edge_se_sampler.bench.real.trials import VARIANTS, Settings, Trial, run_trial, training_length
@@ -41,8 +43,9 @@ class BenchReal(ExperimentCommand):
             find_scene(self.scenes_dir, scene)
         every = product(self.seeds, self.downscales, self.budgets, self.scenes, self.variants)
         trials = [Trial(scene, down, budget, variant, seed) for seed, down, budget, scene, variant in every]
-        settings, scenes_dir, workplace = Settings(), self.scenes_dir.resolve(), self.workplace.resolve()
-        return Experiment("real", settings, lambda _: trials, run_trial, lambda _: (scenes_dir, workplace, settings))
+        settings = Settings()
+        arguments = self.scenes_dir.resolve(), self.workplace.resolve(), settings, self.workers or 1
+        return Experiment("real", settings, lambda _: trials, run_trial, lambda _: arguments)
 
     def default_workers(self) -> int:
         return 1

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from edge_se_sampler.bench.chart.variants import UNIFORM_PIXELS
 from edge_se_sampler.bench.machine import resident_memory
@@ -84,8 +85,11 @@ def training_length(budget: str, members: int = 1) -> dict[str, Any]:
     return {"max_num_iterations": max(1, int(steps) // members)}
 
 
-def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
+def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings, at_once: int = 1) -> Run:
     """Train in a process of its own, and measure on test, validation and some training views.
+
+    Args:
+        at_once: How many trainings share the machine's cores.
 
     Returns:
         size of the images, width and height in pixels; PSNR on each split, None where validation views are the test
@@ -93,10 +97,11 @@ def run_trial(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -
         finest cells; the process's peak of resident memory, GiB; seconds that rendering and measuring
         a test view take.
     """
-    return run_in_subprocess(_train_and_measure, trial, scenes, workplace, settings)
+    return run_in_subprocess(_train_and_measure, trial, scenes, workplace, settings, at_once)
 
 
-def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Settings) -> Run:
+def _train_and_measure(trial: Trial, scenes: Path, workplace: Path, settings: Settings, at_once: int) -> Run:
+    torch.set_num_threads(max(1, torch.get_num_threads() // at_once))
     with contextlib.redirect_stderr(io.StringIO()):
         trained = [_train(trial, member, scenes, workplace) for member in range(MEMBERS.get(trial.variant, 1))]
     peak = resident_memory("VmHWM")
