@@ -90,6 +90,18 @@ def test_the_page_has_medians_and_differences_on_the_same_seeds(tmp_path: Path) 
     assert "| lego, 400 px | 1m | no hull | 29.50 | -0.50 | 1 | 1.00 |" in page
 
 
+def test_uniform_pixels_have_rows_and_a_line_of_their_own(tmp_path: Path) -> None:
+    runs = [run_of(30.0, 0), run_of(31.0, 0, scene="chair")]
+    runs += [run_of(29.0, seed, budget=budget, variant="uniform pixels") for seed, budget in ((0, "1m"), (0, "60m"))]
+    folder = result_of(tmp_path, runs)
+    page = describe(folder)
+    assert "| lego, 400 px | 30.00 | – |\n| lego, 400 px, uniform pixels | 29.00 | 29.00 |" in page
+    assert "| lego, 400 px, uniform pixels | 60m | 29.00 | 0.95 |" in page
+    assert "| lego, 400 px | 1m | uniform pixels | 29.00 | -1.00 | 1 | 1.00 |" in page
+    lines = {line.get_label(): line for line in draw_chart(runs, {}).axes[1].lines}
+    assert lines["lean-nerf, uniform pixels"].get_xydata().tolist() == [[60, 29], [3600, 29]]
+
+
 def test_budgets_of_steps_are_told_where_one_thing_is_changed_and_nowhere_else(tmp_path: Path) -> None:
     runs = [run_of(30.0, 0), run_of(29.0, 0, budget="2000 steps"), run_of(25.0, 0, budget="500 steps")]
     runs += [

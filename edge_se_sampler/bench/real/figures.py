@@ -11,6 +11,7 @@ from edge_se_sampler.bench.chart.summary import mean_psnr_at
 from edge_se_sampler.bench.real.published import PIXELS, PUBLISHED
 from edge_se_sampler.bench.real.summary import (
     BASELINE,
+    UNIFORM,
     WITHOUT_MASKS,
     Trainings,
     by_program,
@@ -26,11 +27,13 @@ from edge_se_sampler.engine.figures import require_pyplot, style_axes
 
 TICKS = {10: "10 s", 60: "1 min", 180: "3 min", 600: "10 min", 3600: "1 h", 86400: "1 d"}
 MARKS = "s^Dv*P"
+LINES = {BASELINE: ("-", "black"), UNIFORM: ("-.", "C7"), WITHOUT_MASKS: ("--", "black")}
+"""Style and color, by variant."""
 
 
 def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> Any:
-    """A panel for every scene and size: lean-nerf black, a band over seeds, and dashed without masks; other programs
-    dotted; published results of GPUs as marks, where images have their size."""
+    """A panel for every scene and size: lean-nerf black, a band over seeds, dashed without masks, gray with uniform
+    pixels; other programs dotted; published results of GPUs as marks, where images have their size."""
     panels = panels_of(runs)
     beside = {panel: by_program(baselines, panel) for panel in panels}
     colors = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(chain(*beside.values())))}
@@ -40,8 +43,8 @@ def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> A
         rows, columns, figsize=(4.6 * columns, 3.2 * rows), squeeze=False, layout="constrained"
     )
     for axis, panel in zip(axes.flat, panels, strict=False):
-        for variant, linestyle in ((BASELINE, "-"), (WITHOUT_MASKS, "--")):
-            _draw_budgets(axis, [r for r in runs if panel_of(r) == panel and r["variant"] == variant], linestyle)
+        for variant in LINES:
+            _draw_budgets(axis, [r for r in runs if panel_of(r) == panel and r["variant"] == variant])
         for name, trainings in beside[panel].items():
             for found in trainings:
                 _draw_curve(axis, found, label=name, color=colors[name])
@@ -67,15 +70,16 @@ def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> A
     return figure
 
 
-def _draw_budgets(axis: Any, runs: list[Run], linestyle: str) -> None:
+def _draw_budgets(axis: Any, runs: list[Run]) -> None:
     """The median over seeds at every time budget, each a training of its own."""
     if runs:
         by_seconds = {seconds_of(budget): psnr for budget, psnr in psnr_by_budget(runs).items()}
         medians = [statistics.median(psnr) for psnr in by_seconds.values()]
-        style = {"color": "black", "linewidth": 2, "marker": "o", "markersize": 4, "linestyle": linestyle, "zorder": 3}
+        linestyle, color = LINES[runs[0]["variant"]]
+        style = {"color": color, "linewidth": 2, "marker": "o", "markersize": 4, "linestyle": linestyle, "zorder": 3}
         axis.plot(list(by_seconds), medians, label=name_of(runs[0]["variant"]), **style)
         low, high = ([over(psnr) for psnr in by_seconds.values()] for over in (min, max))
-        axis.fill_between(list(by_seconds), low, high, color="black", alpha=0.12, linewidth=0)
+        axis.fill_between(list(by_seconds), low, high, color=color, alpha=0.12, linewidth=0)
 
 
 def _draw_curve(axis: Any, runs: Trainings, **style: Any) -> None:

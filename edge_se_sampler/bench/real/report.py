@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.baselines.run import read_baselines
-from edge_se_sampler.bench.real.figures import draw_chart
+from edge_se_sampler.bench.real.figures import LINES, draw_chart
 from edge_se_sampler.bench.real.published import PUBLISHED
 from edge_se_sampler.bench.real.summary import (
     BASELINE,
+    UNIFORM,
     WITHOUT_MASKS,
-    Panel,
     best_psnr_at,
     by_program,
     label_of,
@@ -29,8 +30,8 @@ from edge_se_sampler.bench.report import decimals, describe_command, fill_templa
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.engine.figures import save_figure
 
-Key = tuple[Panel, str]
-"""Scene and size; budget."""
+Key = tuple[str, str]
+"""What was trained: scene, size, and what was changed, if anything; budget."""
 Baselines = Mapping[str, Mapping[str, Any]]
 """Results of other programs."""
 
@@ -38,14 +39,14 @@ Baselines = Mapping[str, Mapping[str, Any]]
 def draw(folder: Path, workplace: Path | None) -> None:
     del workplace
     result, baselines = _read(folder)
-    if runs := [run for run in timed(result["runs"]) if run["variant"] in (BASELINE, WITHOUT_MASKS)]:
+    if runs := [run for run in timed(result["runs"]) if run["variant"] in LINES]:
         save_figure(draw_chart(runs, baselines), folder / "chart.png")
 
 
 def describe(folder: Path) -> str:
     """The README.md of a folder with a result.json."""
     result, baselines = _read(folder)
-    runs = _of_baseline(result["runs"])
+    runs = _tabulated(result["runs"])
     return fill_template(
         __file__,
         folder,
@@ -63,7 +64,7 @@ def describe(folder: Path) -> str:
 def tables(folder: Path) -> dict[str, str]:
     """Tables that other texts show, by name."""
     runs = read_result(folder / "result.json")["runs"]
-    return {"real": _table_of_psnr(_of_baseline(runs))}
+    return {"real": _table_of_psnr(_tabulated(runs))}
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], Baselines]:
@@ -72,17 +73,19 @@ def _read(folder: Path) -> tuple[dict[str, Any], Baselines]:
     return result, read_baselines(folder, threads=result["machine"]["threads"])
 
 
-def _of_baseline(runs: list[Run]) -> list[Run]:
-    """lean-nerf's with a time budget; others are looked at where one thing is changed."""
-    return [run for run in timed(runs) if run["variant"] == BASELINE]
+def _tabulated(runs: list[Run]) -> list[Run]:
+    """lean-nerf's with a time budget, and those that drew their pixels uniformly; others are looked at where one thing
+    is changed."""
+    return [run for run in timed(runs) if run["variant"] in (BASELINE, UNIFORM)]
 
 
 def _by_key(runs: list[Run]) -> dict[Key, list[Run]]:
     groups = {}
-    for panel in panels_of(runs):
-        of_panel = [run for run in runs if panel_of(run) == panel]
-        for budget in _budgets(of_panel):
-            groups[panel, budget] = [run for run in of_panel if run["budget"] == budget]
+    for panel, variant in product(panels_of(runs), (BASELINE, UNIFORM)):
+        label = label_of(panel) + (f", {variant}" if variant != BASELINE else "")
+        found = [run for run in runs if panel_of(run) == panel and run["variant"] == variant]
+        for budget in _budgets(found):
+            groups[label, budget] = [run for run in found if run["budget"] == budget]
     return groups
 
 
@@ -102,10 +105,10 @@ def _show_median(runs: list[Run], name: str) -> str:
 def _table_of_psnr(runs: list[Run]) -> str:
     """Scenes and sizes by budgets; in brackets the least and the largest of several seeds."""
     budgets, rows = _budgets(runs), {}
-    for (panel, budget), group in _by_key(runs).items():
+    for (label, budget), group in _by_key(runs).items():
         psnrs = sorted(run["psnr"] for run in group)
         spread = f" ({decimals(psnrs[0])} to {decimals(psnrs[-1])})" if len(psnrs) > 1 else ""
-        row = rows.setdefault(label_of(panel), dict.fromkeys(budgets, "–"))
+        row = rows.setdefault(label, dict.fromkeys(budgets, "–"))
         row[budget] = decimals(_median(group, "psnr")) + spread
     return markdown_table(["", *budgets], ([label, *row.values()] for label, row in rows.items()))
 
@@ -140,8 +143,8 @@ def _table_of_published() -> str:
 
 def _table_of(runs: list[Run], columns: dict[str, str]) -> str:
     rows = (
-        [label_of(panel), budget, *(_show_median(group, name) for name in columns.values())]
-        for (panel, budget), group in _by_key(runs).items()
+        [label, budget, *(_show_median(group, name) for name in columns.values())]
+        for (label, budget), group in _by_key(runs).items()
     )
     return markdown_table(["", "budget", *columns], rows)
 
@@ -156,8 +159,7 @@ def _table_of_costs(runs: list[Run]) -> str:
         "rendering and measuring a view": lambda group: f"{_median(group, 'seconds_per_view'):.2f} s",
     }
     rows = (
-        [label_of(panel), budget, *(show(group) for show in columns.values())]
-        for (panel, budget), group in _by_key(runs).items()
+        [label, budget, *(show(group) for show in columns.values())] for (label, budget), group in _by_key(runs).items()
     )
     return markdown_table(["", "budget", *columns], rows)
 
@@ -165,12 +167,15 @@ def _table_of_costs(runs: list[Run]) -> str:
 def _table_of_variants(runs: list[Run]) -> str:
     """Empty where nothing was changed."""
     rows: list[list[Any]] = []
-    for (panel, budget), group in _by_key(runs).items():
-        for variant in sorted({run["variant"] for run in group} - {BASELINE}):
+    variants = sorted({run["variant"] for run in runs} - {BASELINE})
+    for panel in panels_of(runs):
+        of_panel = [run for run in runs if panel_of(run) == panel]
+        for budget, variant in product(_budgets(of_panel), variants):
+            group = [run for run in of_panel if run["budget"] == budget]
             changed = [run for run in group if run["variant"] == variant]
             seeds = {run["seed"] for run in changed}
             baseline = [run for run in group if run["variant"] == BASELINE and run["seed"] in seeds]
-            if len(baseline) == len(changed):
+            if changed and len(baseline) == len(changed):
                 psnr, before = _median(changed, "psnr"), _median(baseline, "psnr")
                 row = [label_of(panel), budget, variant, decimals(psnr), f"{psnr - before:+.2f}", str(len(seeds))]
                 rows.append([*row, f"{_median(changed, 'cpu_seconds') / _median(baseline, 'cpu_seconds'):.2f}"])

@@ -9,8 +9,8 @@ from typing import Any
 from edge_se_sampler.bench.real.published import PIXELS
 from edge_se_sampler.bench.runner import Run
 
-BASELINE, WITHOUT_MASKS = "lean-nerf", "no hull"
-"""Variants: the one that others are compared with, and the one that knows no masks in advance."""
+BASELINE, UNIFORM, WITHOUT_MASKS = "lean-nerf", "uniform pixels", "no hull"
+"""Variants: the one that others are compared with, that without edges, and the one that knows no masks in advance."""
 STEPS = " steps"
 """Ends a budget that is a number of training steps."""
 Panel = tuple[str, tuple[int, int]]
