@@ -27,12 +27,12 @@ from edge_se_sampler.engine.figures import require_pyplot, style_axes
 
 TICKS = {10: "10 s", 60: "1 min", 180: "3 min", 600: "10 min", 3600: "1 h", 86400: "1 d"}
 MARKS = "s^Dv*P"
-LINES = {BASELINE: ("-", "black"), UNIFORM: ("-.", "C7"), WITHOUT_MASKS: ("--", "black")}
+LINES = {BASELINE: ("-", "black"), UNIFORM: ("-.", "C5"), WITHOUT_MASKS: ("--", "black")}
 """Style and color, by variant."""
 
 
 def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> Any:
-    """A panel for every scene and size: lean-nerf black, a band over seeds, dashed without masks, gray with uniform
+    """A panel for every scene and size: lean-nerf black, a band over seeds, dashed without masks, brown with uniform
     pixels; other programs dotted; published results of GPUs as marks, where images have their size."""
     panels = panels_of(runs)
     beside = {panel: by_program(baselines, panel) for panel in panels}
@@ -80,6 +80,7 @@ def _draw_budgets(axis: Any, runs: list[Run]) -> None:
         axis.plot(list(by_seconds), medians, label=name_of(runs[0]["variant"]), **style)
         low, high = ([over(psnr) for psnr in by_seconds.values()] for over in (min, max))
         axis.fill_between(list(by_seconds), low, high, color=color, alpha=0.12, linewidth=0)
+        axis.vlines(list(by_seconds), low, high, color=color, alpha=0.3)  # a band at a single moment has no width
 
 
 def _draw_curve(axis: Any, runs: Trainings, **style: Any) -> None:
