@@ -126,6 +126,7 @@ def test_a_budget_is_a_time_or_a_number_of_steps(budget: str, scenes: Path, tmp_
         command.experiment()
 
 
+@pytest.mark.slow
 def test_a_training_has_as_many_steps_as_its_budget(scenes: Path, tmp_path: Path) -> None:
     run = run_trial(Trial("bricks", 1, "3 steps", "lean-nerf", 0), scenes, tmp_path, Settings(num_train_views=2))
     assert run["steps"] == 3

@@ -227,6 +227,7 @@ def test_a_full_disk_under_standard_output_is_one_line(arguments: str):
     assert "No space left" in process.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="a shell's closed files")
 def test_a_training_needs_no_standard_output(scene: Path, tmp_path: Path):
     flags = ["train", "edge-se-nerf", "--data", scene, "--output-dir", tmp_path, *SMALL]
