@@ -43,8 +43,8 @@ class BenchReal(ExperimentCommand):
             find_scene(self.scenes_dir, scene)
         every = product(self.seeds, self.downscales, self.budgets, self.scenes, self.variants)
         trials = [Trial(scene, down, budget, variant, seed) for seed, down, budget, scene, variant in every]
-        settings = Settings()
-        arguments = self.scenes_dir.resolve(), self.workplace.resolve(), settings, self.workers or 1
+        settings, at_once = Settings(), self.workers or self.default_workers()
+        arguments = self.scenes_dir.resolve(), self.workplace.resolve(), settings, at_once
         return Experiment("real", settings, lambda _: trials, run_trial, lambda _: arguments)
 
     def default_workers(self) -> int:

@@ -32,6 +32,8 @@ from edge_se_sampler.engine.figures import save_figure
 
 Key = tuple[str, str]
 """What was trained: scene, size, and what was changed, if anything; budget."""
+TABULATED = BASELINE, UNIFORM
+"""Variants with rows of their own; others are looked at where one thing is changed."""
 Baselines = Mapping[str, Mapping[str, Any]]
 """Results of other programs."""
 
@@ -74,14 +76,13 @@ def _read(folder: Path) -> tuple[dict[str, Any], Baselines]:
 
 
 def _tabulated(runs: list[Run]) -> list[Run]:
-    """lean-nerf's with a time budget, and those that drew their pixels uniformly; others are looked at where one thing
-    is changed."""
-    return [run for run in timed(runs) if run["variant"] in (BASELINE, UNIFORM)]
+    """Those with a time budget that have rows of their own."""
+    return [run for run in timed(runs) if run["variant"] in TABULATED]
 
 
 def _by_key(runs: list[Run]) -> dict[Key, list[Run]]:
     groups = {}
-    for panel, variant in product(panels_of(runs), (BASELINE, UNIFORM)):
+    for panel, variant in product(panels_of(runs), TABULATED):
         label = label_of(panel) + (f", {variant}" if variant != BASELINE else "")
         found = [run for run in runs if panel_of(run) == panel and run["variant"] == variant]
         for budget in _budgets(found):
