@@ -97,9 +97,20 @@ def decimals(value: float | None) -> str:
 
 
 def read_notes(folder: Path) -> str:
-    """An experiment's notes.md: remarks by hand, which no number shows."""
+    """An experiment's notes.md: remarks by hand, which no number shows. A heading on top is no remark."""
+    return _split_notes(folder)[1]
+
+
+def read_title(folder: Path, default: str) -> str:
+    """The heading on top of an experiment's notes.md, or the default where there is none."""
+    return _split_notes(folder)[0] or default
+
+
+def _split_notes(folder: Path) -> tuple[str, str]:
     notes = folder / "notes.md"
-    return notes.read_text(encoding="utf-8").strip() if notes.exists() else ""
+    text = notes.read_text(encoding="utf-8") if notes.exists() else ""
+    first, _, rest = text.partition("\n")
+    return (first[2:].strip(), rest.strip()) if first.startswith("# ") else ("", text.strip())
 
 
 def describe_machine(machine: Mapping[str, Any]) -> str:

@@ -26,7 +26,14 @@ from edge_se_sampler.bench.real.summary import (
     seconds_of,
     timed,
 )
-from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
+from edge_se_sampler.bench.report import (
+    decimals,
+    describe_command,
+    fill_template,
+    markdown_table,
+    read_notes,
+    read_title,
+)
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.engine.figures import save_figure
 
@@ -52,6 +59,7 @@ def describe(folder: Path) -> str:
     return fill_template(
         __file__,
         folder,
+        title=read_title(folder, "lean-nerf on real scenes"),
         psnr=_table_of_psnr(runs),
         baselines=_table_of_baselines(timed(result["runs"]), baselines),
         published=_table_of_published(),
