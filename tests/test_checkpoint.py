@@ -72,6 +72,7 @@ def test_the_latest_checkpoint_has_the_highest_step(tmp_path: Path):
         (tmp_path / f"step-{step:09d}.ckpt").write_bytes(b"")
     (tmp_path / "step-1000000000.ckpt").write_bytes(b"")
     (tmp_path / ".step-9999999999.ckpt.tmp").write_bytes(b"")
+    (tmp_path / "step-2000000000 (copy).ckpt").write_bytes(b"")
     assert latest_checkpoint(tmp_path).name == "step-1000000000.ckpt"
 
 

@@ -112,6 +112,15 @@ def test_nothing_to_learn_gives_no_gradient() -> None:
     assert not any(gradient.any() for gradient in gradients(field, 0 * density.sum() + 0 * color.sum()))
 
 
+def test_rays_that_meet_no_cell_give_no_gradient() -> None:
+    model = MODELS["grid"](True).train()
+    model.begin_step(0, 5)
+    rays = tiny_rays(RAYS)
+    rays.origins.add_(100.0)
+    model.training_loss(rays, {"image": random(RAYS, 4)})[0].mean().backward()
+    assert all(not parameter.grad.any() for parameter in model.parameters() if parameter.grad is not None)
+
+
 def fixed_draws(model: NeRFModel, monkeypatch: pytest.MonkeyPatch) -> NeRFModel:
     """The model with draws that depend on their shape alone."""
     monkeypatch.setattr(model, "uniform", lambda rows, columns: random(rows, columns, seed=columns))

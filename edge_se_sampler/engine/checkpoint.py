@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -24,7 +25,7 @@ from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 MAGIC = b"edge-se-checkpoint 3 "
 MAGIC_2 = b"edge-se-checkpoint 2 "
 """Of format 2, whose checksum leaves out the line itself."""
-NAMES = f"step-{9 * '[0-9]'}*.ckpt"
+NAME = re.compile(r"step-(\d{9,})\.ckpt")
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
@@ -32,7 +33,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> Path:
     of later steps are deleted as well: they were damaged, or the steps would not have been trained again."""
     path = folder / f"step-{step:09d}.ckpt"
     write_atomically(path, lambda file: _write(state, file))
-    others = [other for other in folder.glob(NAMES) if other != path]
+    others = [other for other in _checkpoints(folder) if other != path]
     before = max((other for other in others if _step_of(other) < step), key=_step_of, default=None)
     with os_errors_as_input_errors(f"{folder}: older checkpoints cannot be deleted"):
         for other in (*others, *folder.glob(".step-*.tmp")):
@@ -75,7 +76,7 @@ def _write(state: dict[str, Any], file: BinaryIO) -> None:
 
 def latest_checkpoint(folder: Path) -> Path:
     """The checkpoint with the highest step; InputError if there is none."""
-    latest = max(folder.glob(NAMES), key=_step_of, default=None)
+    latest = max(_checkpoints(folder), key=_step_of, default=None)
     if latest is None:
         raise InputError(f"{folder}: no checkpoint (step-*.ckpt); the run ended before its first was saved")
     return latest
@@ -90,7 +91,7 @@ def load_latest(folder: Path, config_digest: str) -> tuple[Path, dict[str, Any]]
     InputError if all are damaged, or as `load_checkpoint`."""
     latest_checkpoint(folder)
     damaged: list[DamagedCheckpoint] = []
-    for path in sorted(folder.glob(NAMES), key=_step_of, reverse=True):
+    for path in sorted(_checkpoints(folder), key=_step_of, reverse=True):
         try:
             state = load_checkpoint(path, config_digest)
         except DamagedCheckpoint as problem:
@@ -133,6 +134,11 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     except ValueError as problem:
         raise InputError(f"{path}: was not saved by a training ({problem}); do not use it") from problem
     return state
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    """Those of a training; not what else lies there, as a copy of one."""
+    return [path for path in folder.glob("step-*.ckpt") if NAME.fullmatch(path.name)]
 
 
 def _step_of(checkpoint: Path) -> int:

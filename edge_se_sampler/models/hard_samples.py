@@ -50,6 +50,9 @@ class _HardSamples(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         positions, directions, ray_indices, noise, uniform, *outputs = ctx.saved_tensors
+        parameters = tuple(ctx.field.parameters())
+        if len(positions) == 0:  # no ray meets a cell
+            return None, None, None, *map(torch.zeros_like, parameters)
         probability = keep_probability(raw_gradient_norm(ctx.field, outputs, gradients))
         kept = torch.nonzero(uniform < probability)[:, 0]
         if ray_indices is None:
@@ -60,7 +63,6 @@ class _HardSamples(torch.autograd.Function):
         scale = 1 / probability[kept]
         with torch.enable_grad():
             again = ctx.field(positions[kept], directions, rays, None if noise is None else noise[kept])
-        parameters = tuple(ctx.field.parameters())
         by_parameters = torch.autograd.grad(again, parameters, (by_density * scale, by_color * scale[:, None]))
         return None, None, None, *by_parameters
 
