@@ -90,6 +90,14 @@ def test_colors_are_those_of_the_surface() -> None:
     np.testing.assert_allclose(render_colors(model, vertices, normals, 2 * CELL), color_at(vertices), atol=0.02)
 
 
+def test_colors_are_those_of_the_surface_however_much_is_empty_before_cameras() -> None:
+    model = ball_model()
+    position = np.array([[0.0, 0.0, RADIUS], [RADIUS, 0.0, 0.0]])
+    model.grid.focus[:] = torch.tensor([0.0, 0.0, 0.0, 0.9, 9.0])  # else rays begin at 0.9 of the way to the center
+    colors = render_colors(model, position, position / RADIUS, 2 * CELL)
+    np.testing.assert_allclose(colors, color_at(position), atol=0.02)
+
+
 def test_colors_are_asked_from_outside() -> None:
     """Were each vertex seen from within, the ball would show its other side."""
     model = ball_model()

@@ -76,7 +76,7 @@ def test_a_picture_is_put_together_from_its_turns(viewed: Viewed) -> None:
     camera, renderer = VIEWS.cameras[[2]], Renderer(viewed)
     renderer.turn = SimpleNamespace(rays=37, record=lambda *_: None)  # type: ignore[assignment]
     keys = ["rgb_fine", "depth_fine"]
-    found = renderer.render(camera, keys, lambda: False, depths=None)
+    found = renderer.render(camera, keys, lambda: False, everything=False)
     whole = render_outputs(viewed.model, camera.to(dtype=torch.float32).image_rays(0), keys)
     assert found is not None
     for key in keys:

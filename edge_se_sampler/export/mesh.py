@@ -89,10 +89,13 @@ def render_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, b
     """Colors (n, 3) in [0, 1] of a surface: those of rays along its inward normals, which begin that far outside. For
     training fits the colors of rays: at the surface itself, where these have little weight yet, the network's color may
     be any."""
-    origins = torch.from_numpy(positions + normals * (before + model.config.depths[0]))
+    near, far = model.config.depths
+    origins = torch.from_numpy(positions + normals * (before + near))
     origins, directions = (x.to(model.device, model.dtype) for x in (origins, torch.from_numpy(-normals)))
-    metadata = {"directions_norm": torch.ones_like(origins[:, :1]), "pixel_axes": origins.new_zeros(len(origins), 2, 3)}
-    rays = RayBundle(origins, directions, torch.zeros_like(origins[:, :1], dtype=torch.int64), metadata)
+    one = torch.ones_like(origins[:, :1])
+    metadata = {"directions_norm": one, "pixel_axes": origins.new_zeros(len(origins), 2, 3)}
+    metadata |= {"nears": near * one, "fars": far * one}  # however much is empty before the training views' cameras
+    rays = RayBundle(origins, directions, torch.zeros_like(one, dtype=torch.int64), metadata)
     colors = []
     with Progress(len(rays), "rendering colors") as progress:
         for start in range(0, len(rays), RAYS_AT_ONCE):

@@ -176,21 +176,18 @@ class LeanModel(RayModel):
         return outputs | {"background": background}, rendered
 
     def _spans(self, rays: RayBundle) -> RaySpans:
-        """Rays in units of cells, from where they enter the box, or the near depth, to where they leave it. Where a
-        share of the way to the focus is empty, they begin no nearer: right before a camera, where no other image tells,
-        training would put a picture of its image, which other views see as floaters."""
+        """Rays in units of cells, from where they enter the box, or the near depth or what is empty ends, to where they
+        leave it."""
         cell_size = float(self.grid.cell_size)
         origins = self.grid.to_cell_units(rays.origins).to(self.dtype)
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
         norm = rays.metadata["directions_norm"][:, 0] / cell_size
-        near, far = (depth * norm for depth in self.config.depths)
         if "nears" in rays.metadata:
             near, far = (rays.metadata[name][:, 0] / cell_size for name in ("nears", "fars"))
-        *focus, share, farthest = self.grid.focus.tolist()
-        if share:
-            distance = (rays.origins - rays.origins.new_tensor(focus)).norm(dim=1).clamp(max=farthest)
-            near = torch.maximum(near, share * distance * norm)
+        else:
+            near, far = (depth * norm for depth in self.config.depths)
+            near = torch.maximum(near, self.grid.empty_depth(rays.origins) * norm)
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
         end = torch.maximum(one, other).amin(dim=1)
         # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid

@@ -161,6 +161,14 @@ class BrickGrid(nn.Module):
         """Whether both began with the same cells."""
         return bool((self.scene == other.scene).all())
 
+    def empty_depth(self, origins: Tensor) -> Tensor:
+        """(n,) world units: the depth up to which nothing is in rays from there, by the `focus`. Right before a camera,
+        where no other image tells, training would put a picture of its image, which other views see as floaters."""
+        *focus, share, farthest = self.focus.tolist()
+        if not share:
+            return origins.new_zeros(len(origins))
+        return share * (origins - origins.new_tensor(focus)).norm(dim=1).clamp(max=farthest)
+
     @property
     def num_rows(self) -> int:
         return self.occupied.numel()

@@ -55,11 +55,11 @@ class Renderer:
         self.viewed, self.frame, self.turn = viewed, Pace(FRAME_SECONDS), Pace(TURN_SECONDS)
 
     def render(
-        self, camera: Cameras, keys: Sequence[str], interrupted: Callable[[], bool], depths: tuple[float, float] | None
+        self, camera: Cameras, keys: Sequence[str], interrupted: Callable[[], bool], *, everything: bool
     ) -> dict[str, Tensor] | None:
         """Some of the model's outputs (H, W, channels) for a camera, on the CPU; None: interrupted. A turn ends after
-        some rays: training goes on, others look, and whether the picture is still wanted is asked again. lean-nerf
-        samples rays between `depths`, world units from the camera, if there are any, instead of the model's."""
+        some rays: training goes on, others look, and whether the picture is still wanted is asked again. Of lean-nerf
+        `everything` is seen that the model has, also nearer or farther off than the depths of its training views."""
         height, width = int(camera.height[0]), int(camera.width[0])
         count, first, turns, began = height * width, 0, [], time.monotonic()
         while first < count:
@@ -69,8 +69,9 @@ class Renderer:
             with self.viewed.turns:
                 turn_began, model = time.monotonic(), self.viewed.model
                 rays = camera.to(model.device, torch.float32).image_rays(0, slice(first, last))
-                for name, depth in zip(("nears", "fars"), depths or (), strict=False):
-                    rays.metadata[name] = torch.full_like(rays.directions[:, :1], depth)
+                if everything and model.grid is not None:
+                    empty = model.grid.empty_depth(rays.origins)[:, None] * rays.metadata["directions_norm"]
+                    rays.metadata.update(nears=empty, fars=torch.full_like(empty, math.inf))
                 turns.append(render_outputs(model, rays, keys))
                 self.turn.record(last - first, time.monotonic() - turn_began)
             first = last
@@ -80,8 +81,7 @@ class Renderer:
     def picture(self, camera: Cameras, output: str, interrupted: Callable[[], bool]) -> np.ndarray | None:
         """One of OUTPUTS as (H, W, 3) uint8; None: interrupted."""
         keys = ["rgb_fine"] if output == "rgb" else ["accumulation_fine", "depth_fine"]
-        # from farther off than any training view, or nearer by
-        found = self.render(camera, keys, interrupted, depths=(0.0, math.inf))
+        found = self.render(camera, keys, interrupted, everything=True)
         if found is None:
             return None
         if output == "rgb":
@@ -95,7 +95,7 @@ class Renderer:
 
     def squared_error(self, k: int, interrupted: Callable[[], bool]) -> np.ndarray | None:
         """(H, W) squared error of every pixel of the kth training view, a mean over channels; None: interrupted."""
-        found = self.render(self.viewed.cameras[[k]], ["rgb_fine"], interrupted, depths=None)
+        found = self.render(self.viewed.cameras[[k]], ["rgb_fine"], interrupted, everything=False)
         if found is None:
             return None
         return np.square(found["rgb_fine"].numpy() - unit_float(self.viewed.image(k))).mean(axis=2)
