@@ -16,6 +16,7 @@ from capture_folder import HEIGHT, OPENCV, WIDTH, write_colmap, write_transforms
 
 from edge_se_sampler.bench.baselines.folders import copied_scene
 from edge_se_sampler.bench.baselines.run import mean_psnr, read_test_pictures
+from edge_se_sampler.bench.train import offcenter_copies
 from edge_se_sampler.data.capture import SPLITS
 from edge_se_sampler.data.dataset import DataSettings, find_format, read_split
 from edge_se_sampler.data.views import Views
@@ -35,6 +36,21 @@ def assert_same_views(found: Views, expected: Views) -> None:
         rays, own = (views.cameras.image_rays(i) for views in (found, expected))
         torch.testing.assert_close(rays.origins, own.origins)
         torch.testing.assert_close(rays.directions, own.directions)
+
+
+@pytest.mark.parametrize("made", [copied_scene, lambda workplace, data, _: offcenter_copies(data, workplace)])
+def test_a_copy_that_another_process_makes_meanwhile_is_taken(
+    made: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_scene(tmp_path / "scene")
+    expected = made(tmp_path / "workplace", tmp_path / "scene", 1)
+    file = next(path for path in expected.rglob("*") if path.is_file())
+    answers = iter([False])  # of the question whether it is there, before it is made
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path: next(answers, True) if path == expected else exists(path))
+    before = file.read_bytes()
+    assert made(tmp_path / "workplace", tmp_path / "scene", 1) == expected
+    assert file.read_bytes() == before
 
 
 def test_a_blender_folder_stays_one(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tiny import tiny_model
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.engine import frames
-from edge_se_sampler.engine.frames import choose_depth_unit, render_frame, write_frames
+from edge_se_sampler.engine.frames import choose_depth_unit, name_checkpoint, render_frame, write_frames
 from edge_se_sampler.errors import InputError
 
 SIZE = {"width": 5, "height": 4}
@@ -131,8 +131,13 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def test_a_checkpoint_that_a_training_has_deleted_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"step-9\.ckpt: cannot be read"):
+        name_checkpoint(tmp_path / "step-9.ckpt")
+
+
 def test_a_folder_says_what_its_frames_are(tmp_path: Path, checkpoint: Path) -> None:
-    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb", "raw-depth"), 0.001, [checkpoint])
+    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb", "raw-depth"), 0.001, [name_checkpoint(checkpoint)])
     names = [f"{output}/0000{i}.png" for output in ("rgb", "raw-depth") for i in range(3)]
     assert sorted(files(tmp_path / "out")) == sorted([*names, "frames.json"])
     facts = json.loads((tmp_path / "out" / "frames.json").read_text())
@@ -145,16 +150,16 @@ def test_a_folder_says_what_its_frames_are(tmp_path: Path, checkpoint: Path) -> 
 
 def test_only_what_is_missing_or_broken_is_rendered_again(tmp_path: Path, checkpoint: Path, rendered: list) -> None:
     folder = tmp_path / "out"
-    write_frames(folder, WALL, CAMERAS, ("rgb", "depth"), 0.001, [checkpoint])
+    write_frames(folder, WALL, CAMERAS, ("rgb", "depth"), 0.001, [name_checkpoint(checkpoint)])
     whole = files(folder)
     (folder / "rgb" / "00000.png").write_bytes(whole["rgb/00000.png"][:-30])  # cut short
     (folder / "depth" / "00000.png").write_bytes(b"")
     (folder / "depth" / "00002.png").unlink()
     rendered.clear()
-    write_frames(folder, WALL, CAMERAS, ("rgb", "depth"), 0.001, [checkpoint])
+    write_frames(folder, WALL, CAMERAS, ("rgb", "depth"), 0.001, [name_checkpoint(checkpoint)])
     assert rendered == [(0, ["rgb", "depth"]), (2, ["depth"])]
     assert files(folder) == whole
-    write_frames(folder, WALL, CAMERAS, ("accumulation",), 0.001, [checkpoint])  # another output of the same
+    write_frames(folder, WALL, CAMERAS, ("accumulation",), 0.001, [name_checkpoint(checkpoint)])  # another of the same
     assert rendered[2:] == [(i, ["accumulation"]) for i in range(3)]
 
 
@@ -167,9 +172,9 @@ def test_ctrl_c_keeps_what_is_whole(tmp_path: Path, checkpoint: Path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(frames, "render_frame", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [checkpoint])
+            write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     assert sorted(files(tmp_path / "out")) == ["frames.json", "rgb/00000.png"]
-    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [checkpoint])
+    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     assert len(files(tmp_path / "out")) == 4
 
 
@@ -178,7 +183,7 @@ def test_a_process_that_was_killed_at_its_first_file_leaves_a_folder_to_go_on_wi
 ) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / ".frames.json.tmp").write_text('{"check')
-    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [checkpoint])
+    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     assert sorted(files(tmp_path / "out")) == ["frames.json", *(f"rgb/0000{i}.png" for i in range(3))]
 
 
@@ -198,20 +203,20 @@ OTHERS: dict[str, Callable[[], tuple[Cameras, float, bytes]]] = {
 @pytest.mark.parametrize("differing", OTHERS)
 def test_frames_of_other_settings_never_mix(differing: str, tmp_path: Path, checkpoint: Path) -> None:
     folder = tmp_path / "out"
-    write_frames(folder, WALL, CAMERAS[[0, 1, 2]], ("rgb",), 0.001, [checkpoint])
+    write_frames(folder, WALL, CAMERAS[[0, 1, 2]], ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     (folder / "rgb" / "00001.png").unlink()
     before = files(folder)
     cameras, unit, content = OTHERS[differing]()
     checkpoint.write_bytes(content)
     with pytest.raises(InputError, match=re.escape(f"({differing})")):
-        write_frames(folder, WALL, cameras, ("rgb",), unit, [checkpoint])
+        write_frames(folder, WALL, cameras, ("rgb",), unit, [name_checkpoint(checkpoint)])
     assert files(folder) == before
 
 
 def test_what_the_last_digits_of_a_pose_say_is_no_other_camera(tmp_path: Path, checkpoint: Path) -> None:
-    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [checkpoint])
+    write_frames(tmp_path / "out", WALL, CAMERAS, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     nearly = replace(CAMERAS, fx=CAMERAS.fx + 1e-13)
-    write_frames(tmp_path / "out", WALL, nearly, ("rgb",), 0.001, [checkpoint])
+    write_frames(tmp_path / "out", WALL, nearly, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]"])
@@ -220,10 +225,10 @@ def test_folders_that_are_none_of_ours_stay_as_they_are(content: str, tmp_path: 
     folder.mkdir()
     (folder / "holiday.jpg").write_text("sun")
     with pytest.raises(InputError, match="no frames"):
-        write_frames(folder, WALL, CAMERAS, ("rgb",), 0.001, [checkpoint])
+        write_frames(folder, WALL, CAMERAS, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     (folder / "frames.json").write_text(content)
     before = files(folder)
     with pytest.raises(InputError, match=r"frames\.json"):
-        write_frames(folder, WALL, CAMERAS, ("rgb",), 0.001, [checkpoint])
+        write_frames(folder, WALL, CAMERAS, ("rgb",), 0.001, [name_checkpoint(checkpoint)])
     assert files(folder) == before
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["photos"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,14 @@ def test_an_extended_run_goes_on_from_its_optimizers_state(run: Path) -> None:
     steps = {int(state["step"]) for state in trainer.optimizer.state.values()}
     assert steps == {6}
     assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(trainer.config.preset.learning_rate * 0.1**0.2)
+
+
+def test_a_run_that_is_longer_than_its_config_says_has_ended(run: Path) -> None:
+    folder = RunFolder(run)
+    config = replace(folder.config(method_configs()), new_num_iterations=3)
+    trainer = prepare_resume(folder, config, max_seconds=20)
+    trainer.train()
+    assert trainer.next_step == 6
 
 
 def test_a_run_that_is_made_much_longer_does_not_begin_anew_with_edges(run: Path) -> None:

@@ -122,6 +122,17 @@ class TestPixels:
             assert masks[2].all()  # of a frame that has none all counts, as before
             assert iio.imread(folder / "m.png").shape == (6, 10)  # gray, as other hosts want it
 
+    def test_masks_that_no_json_lists_hide_it_too(self, tmp_path: Path) -> None:
+        write_scene(tmp_path / "scene")
+        mask = pixels(9, channels=3)[..., 0] & 1
+        (tmp_path / "scene/masks/train").mkdir(parents=True)
+        iio.imwrite(tmp_path / "scene/masks/train/r_0.png.png", mask * np.uint8(255))
+        for folder, corner in copies_of(tmp_path / "scene"):
+            masks = read_blender(folder, "train").masks
+            assert masks is not None
+            np.testing.assert_array_equal(masks[0], on_canvas(mask, 10, 6, *corner) > 0)
+            assert masks[1].all()
+
 
 class TestCameras:
     @pytest.fixture

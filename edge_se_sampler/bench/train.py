@@ -13,6 +13,7 @@ import torch
 
 from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.data.new_folder import unless_made_meanwhile
 from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import TrainerConfig
@@ -30,12 +31,8 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
     words = [f"{key}-{value}" for key, value in sorted(options.items())]
     folder = workplace / "scenes" / ("_".join(words) or "default")
     if not (folder / name).exists():
-        try:
-            with Progress(0, f"rendering {name}") as progress:
-                make_scenes(folder, [name], progress=progress.update, **options)
-        except OSError:
-            if not (folder / name).exists():  # another shard has rendered it meanwhile
-                raise
+        with unless_made_meanwhile(folder / name), Progress(0, f"rendering {name}") as progress:
+            make_scenes(folder, [name], progress=progress.update, **options)
     return folder / name
 
 
@@ -44,7 +41,7 @@ def offcenter_copies(scene: Path, workplace: Path) -> Path:
     missing; raises as `offcenter`."""
     folder = workplace / "offcenter" / scene.name
     if not folder.exists():
-        with Progress(0, f"moving {scene.name} off center") as progress:
+        with unless_made_meanwhile(folder), Progress(0, f"moving {scene.name} off center") as progress:
             offcenter(scene, folder, progress=progress.update)
     return folder
 

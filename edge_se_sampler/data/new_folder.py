@@ -43,6 +43,16 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def unless_made_meanwhile(folder: Path) -> Iterator[None]:
+    """What makes a folder may fail where another process has made it."""
+    try:
+        yield
+    except InputError:
+        if not folder.exists():
+            raise
+
+
 def _check_not_taken(out: Path, targets: Sequence[Path]) -> None:
     try:
         existing = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))

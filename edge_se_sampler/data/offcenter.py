@@ -28,7 +28,7 @@ from edge_se_sampler.data.blender import has_split, read_blender, transforms_pat
 from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
-from edge_se_sampler.data.transforms_frames import listed_file, read_entries, read_lens
+from edge_se_sampler.data.transforms_frames import Entry, listed_file, read_entries, read_lens
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
@@ -147,10 +147,11 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
         views = read_blender(data, split)
         top = read_json(transforms_path(data, split))
         frames = top.required("frames", "").list()
-        for entry in read_entries(top, data):
+        entries = read_entries(top, data)
+        for entry in entries:
             if read_lens(entry.intrinsics) is not None:
                 raise entry.location.error("its lens distorts", "undistort the images, and leave its coefficients out")
-        plan[split] = [_output_files(data, frame, written) for frame in frames]
+        plan[split] = [_output_files(data, *each, written) for each in zip(frames, entries, strict=True)]
         for image, frame in zip(views.images, frames, strict=True):
             background = plain_background(image)
             if background is None:
@@ -175,8 +176,9 @@ def _image_error(frame: JsonValue, problem: str, hint: str) -> InputError:
     return frame.location.member("file_path").error(f"{listed} {problem}", hint)
 
 
-def _output_files(data: Path, frame: JsonValue, written: dict[str, tuple[str, str]]) -> dict[str, str]:
-    """Where inside a copy the frame's image and mask go; `written` maps files already in use to their source."""
+def _output_files(data: Path, frame: JsonValue, entry: Entry, written: dict[str, tuple[str, str]]) -> dict[str, str]:
+    """Where inside a copy the frame's image and mask go, listed or not; `written` maps files already in use to their
+    source."""
     files = {}
     for key in ("file_path", "mask_path"):
         if value := frame.optional(key):
@@ -190,6 +192,11 @@ def _output_files(data: Path, frame: JsonValue, written: dict[str, tuple[str, st
                 problem = f"{quote(listed)} would be written over another picture, {quote(file)}"
                 raise value.location.error(problem, "give each image and mask a name of its own")
             files[key] = file
+    if entry.mask is not None and "mask_path" not in files:
+        files["mask_path"] = f"masks/{files['file_path']}"
+        source = ("mask_path", str(entry.mask.path))
+        if written.setdefault(files["mask_path"], source) != source:
+            raise frame.location.error(f"its mask would be written over {files['mask_path']}", "list it as mask_path")
     return files
 
 
@@ -220,10 +227,14 @@ def _document(
     top["frames"] = [
         frame
         | {key: value for key, value in own.items() if key in frame or key not in shared}
-        | {key: file for key, file in written.items() if not listed_file(frame[key]).lower().endswith(".png")}
+        | {key: file for key, file in written.items() if not _is_listed_png(frame.get(key))}
         for frame, own, written in zip(source["frames"], intrinsics, files, strict=True)
     ]
     return top
+
+
+def _is_listed_png(path: str | None) -> bool:
+    return path is not None and listed_file(path).lower().endswith(".png")
 
 
 def _write_view(

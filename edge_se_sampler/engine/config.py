@@ -142,6 +142,7 @@ class TrainerConfig(InstantiateConfig):
         manager, model, optimizer = self.pipeline.datamanager, self.pipeline.model, self.optimizer
         at_least_one = {
             "max-num-iterations": self.max_num_iterations,
+            "new-num-iterations": self.new_num_iterations,
             "patience": self.patience,
             "downscale": self.downscale,
             "steps-per-save": self.steps_per_save,

@@ -17,7 +17,7 @@ from edge_se_sampler.data.scene_file import read_json
 from edge_se_sampler.engine.files import make_folder, to_uint8, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import remove_background, render_outputs
-from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.errors import InputError, check_value, os_errors_as_input_errors
 from edge_se_sampler.models.ray_model import RayModel
 
 FRAMES_ONLY = {"rgba": "is transparent", "raw-depth": "has 16 bits"}
@@ -84,12 +84,13 @@ def write_frames(
     cameras: Cameras,
     outputs: Sequence[str],
     depth_unit: float,
-    checkpoints: Sequence[Path],
+    checkpoints: Sequence[str],
 ) -> None:
-    """Write FOLDER/OUTPUT/00000.png, ... of all cameras, and frames.json, which says what they are. What is there and
-    whole is kept. InputError if the folder has other things, or frames of other checkpoints, cameras or units."""
+    """Write FOLDER/OUTPUT/00000.png, ... of all cameras, and frames.json, which says what they are, and of which
+    checkpoints, by `name_checkpoint`. What is there and whole is kept. InputError if the folder has other things, or
+    frames of other checkpoints, cameras or units."""
     facts = {
-        "checkpoint": "; ".join(map(_name_checkpoint, checkpoints)),
+        "checkpoint": "; ".join(checkpoints),
         "depth_unit": depth_unit,
         "depth": "raw-depth: value * depth_unit is the depth along the optical axis in the data's units, 0 is nothing",
         "frames": [_describe(cameras, i) for i in range(len(cameras))],
@@ -108,8 +109,9 @@ def write_frames(
             progress.update(done)
 
 
-def _name_checkpoint(path: Path) -> str:
-    with open(path, "rb") as file:
+def name_checkpoint(path: Path) -> str:
+    """Its step, and the checksum that tells it from another run's; InputError if it is gone."""
+    with os_errors_as_input_errors(f"{path}: cannot be read"), open(path, "rb") as file:
         return f"{path.stem}, sha256 {file.readline().split()[-1].decode()}"  # every checkpoint begins with its own
 
 

@@ -117,7 +117,7 @@ class Trainer:
         (self.setup_seconds,) = ranks.agree(self.setup_seconds)
         plan.decide(self.next_step, self.setup_seconds + self.elapsed)
         with self._interruptible(), Progress(plan.num_steps or 0, config.method_name, self.next_step) as progress:
-            while self.next_step != plan.num_steps:
+            while plan.num_steps is None or self.next_step < plan.num_steps:
                 step = self.next_step
                 learning_rate = float(self.optimizer.param_groups[0]["lr"])
                 with self.turns:

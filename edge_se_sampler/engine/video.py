@@ -18,7 +18,7 @@ from edge_se_sampler.data.camera_path import read_camera_path, undo_dataparser
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, write_atomically
-from edge_se_sampler.engine.frames import FRAMES_ONLY, choose_depth_unit, render_frame, write_frames
+from edge_se_sampler.engine.frames import FRAMES_ONLY, choose_depth_unit, name_checkpoint, render_frame, write_frames
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_ensemble, read_test_views, read_train_views
@@ -60,7 +60,8 @@ def render_run(
     if output_path.suffix:
         check_video(output_path, outputs, rate)
     unit = choose_depth_unit(config.pipeline.model.depths[1], depth_unit)
-    model, checkpoints = load_ensemble(runs)
+    model, paths = load_ensemble(runs)
+    checkpoints = [name_checkpoint(path) for path in paths]  # now: a training may delete them meanwhile
     cameras = find_cameras(config, kind or "spiral", num_frames) if path is None else path.cameras
     if output_path.suffix:
         write_video(output_path, _video_frames(model, cameras, outputs, unit), rate)

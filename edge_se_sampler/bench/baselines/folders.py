@@ -20,7 +20,7 @@ import numpy as np
 from edge_se_sampler.data.blender import transforms_path
 from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
-from edge_se_sampler.data.new_folder import staged_folders
+from edge_se_sampler.data.new_folder import staged_folders, unless_made_meanwhile
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.progress import Progress
 
@@ -30,7 +30,7 @@ def copied_scene(workplace: Path, data: Path, downscale: int) -> Path:
     source = data.resolve()
     copy = workplace / "scenes" / f"downscale-{downscale}" / Path(*source.parts[1:])
     if not copy.exists():
-        with Progress(0, f"copying {source.name}") as progress:
+        with unless_made_meanwhile(copy), Progress(0, f"copying {source.name}") as progress:
             settings = DataSettings(downscale=downscale)
             splits: dict[Split, Views] = {}
             for split in SPLITS:
