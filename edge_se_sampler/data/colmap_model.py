@@ -60,9 +60,6 @@ class ColmapImage:
     """(m,) int64: the points that it sees, -1 for features that are none."""
 
 
-Record = tuple[SourceLocation, list[float]]
-
-
 def find_model(folder: Path) -> Path | None:
     """The folder with cameras, images and points3D of a scene, if there is one."""
     for path in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):

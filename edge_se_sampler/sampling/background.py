@@ -59,7 +59,8 @@ class PlainBackgrounds:
         if image.shape[1] == 4:
             difference = image[:, 3:] * (image[:, :3] - np.array(background_color, dtype=np.float32))
         else:
-            difference = image - np.stack([self._colors[number] for number in numbers.tolist()])
+            images, rows = np.unique(numbers, return_inverse=True)
+            difference = image - np.stack([self._colors[number] for number in images.tolist()])[rows]
         return np.square(difference).sum(axis=1)
 
 

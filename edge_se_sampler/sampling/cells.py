@@ -45,11 +45,6 @@ class CellTable:
     def __len__(self) -> int:
         return len(self.sizes)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the table holds."""
-        return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
-
     def add(self, batch: ImageBatch) -> Tensor:
         """Take up a batch's images, if they are new; (k,) int64: the index of each in this table."""
         numbers = batch.numbers.tolist()
@@ -57,10 +52,13 @@ class CellTable:
         if new:
             self.grow({numbers[k]: batch.sizes[k] for k in new})
             order = {number: i for i, number in enumerate(self.sizes)}
-            for k in new:
-                self._index[numbers[k]] = order[numbers[k]]
-                if batch.mask is not None:
-                    self._mask(order[numbers[k]], batch.valid(k).numpy())
+            self._index |= {numbers[k]: order[numbers[k]] for k in new}
+            if batch.mask is not None:
+                masks, length = [self._bits], len(self._bits)
+                for k in new:
+                    masks.append(self._mask(order[numbers[k]], batch.valid(k).numpy(), 8 * length))
+                    length += len(masks[-1])
+                self._bits = np.concatenate(masks)
             self.refresh()
         return torch.tensor([self._index[number] for number in numbers])
 
@@ -80,14 +78,14 @@ class CellTable:
             grown.append(np.pad(counts, (0, self.first[i + 1] - self.first[i] - len(counts))))
         self.counts = np.concatenate(grown)
 
-    def _mask(self, image: int, valid: np.ndarray) -> None:
-        """Count only the valid (H, W) pixels of an image, and remember them."""
+    def _mask(self, image: int, valid: np.ndarray, first_bit: int) -> np.ndarray:
+        """Count only the valid (H, W) pixels of an image; their bits, which begin at `first_bit`."""
         starts = [-(-np.arange(r) * n // r) for n, r in zip(self.size[image], self.grid[image], strict=True)]
         by_row = np.add.reduceat(valid, starts[0], axis=0, dtype=np.int32)
         counts = np.add.reduceat(by_row, starts[1], axis=1).ravel()
         self.counts[self.first[image] : self.first[image] + len(counts)] = counts
-        self._first_bit[image] = 8 * len(self._bits)
-        self._bits = np.append(self._bits, np.packbits(valid))
+        self._first_bit[image] = first_bit
+        return np.packbits(valid)
 
     def _lay_out(self) -> None:
         """Where each image's cells begin, a whole number of blocks each."""

@@ -15,7 +15,8 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 class LearnedDistribution(Distribution):
     """Draws in proportion to the values of cells, see `CellTable`; a subclass's `update` changes them.
 
-    In a distributed run every process learns from the errors of its own pixels.
+    In nerfstudio's distributed runs every process learns from the errors of its own pixels; our own processes, which
+    draw the same pixels, learn from all.
     """
 
     needs_errors = True

@@ -22,7 +22,8 @@ from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.sampling.image_batch import unit_interval
+from edge_se_sampler.sampling.distribution import UniformPixels
+from edge_se_sampler.sampling.image_batch import ImageBatch, unit_interval
 from edge_se_sampler.sampling.strategies import RankedError
 
 ERROR_SOURCES = {
@@ -73,14 +74,14 @@ def correlate_rankings(trainer: Trainer, step: int) -> dict[str, float]:
     """Spearman's correlation of coarse and cached scores with the fine ones, over pixels drawn uniformly; cached errors
     are looked up at a step."""
     manager, model = trainer.pipeline.datamanager, trainer.pipeline.model
-    sampler, images = manager.train_pixel_sampler, manager.image_batch["image"]
+    sampler, batch = manager.train_pixel_sampler, ImageBatch.of(manager.image_batch, use_mask=False)
     ranked = sampler.strategies["se"].selector
     assert isinstance(ranked, RankedError)
     assert ranked.error_map is not None
     rng = np.random.default_rng(0)
-    pixels = [(n, *rng.integers(images[n].shape[:2])) for n in rng.integers(len(images), size=4096).tolist()]
-    indices = torch.tensor(pixels)
-    image = unit_interval(torch.stack([images[n][row, column] for n, row, column in pixels]))
+    drawn = UniformPixels(batch.sizes).draw(torch.arange(len(batch.sizes)), 4096, rng)
+    pixels = batch.gather(drawn)
+    indices, image = pixels["indices"], unit_interval(pixels["image"])
     outputs = render_outputs(model, manager.cameras.pixel_rays(indices), ("background", "rgb_fine", "rgb_coarse"))
     fine, coarse = (model.squared_error(outputs, image, network).numpy() for network in ("fine", "coarse"))
     cached = ranked.error_map.lookup(indices.numpy(), step, sampler.num_rays_per_batch)

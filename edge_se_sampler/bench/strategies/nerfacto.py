@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from edge_se_sampler.bench.baselines.run import TimeIsUp
 from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views, skip_lpips_weights
 from edge_se_sampler.bench.outcomes import classify, measure_outcome
 from edge_se_sampler.bench.runner import Run
@@ -50,10 +51,6 @@ OF_OBJECTS = {
 }
 """What nerfstudio's own benchmark sets for NeRF's Blender scenes, too."""
 NEVER = 10**9
-
-
-class TimeIsUp(BaseException):
-    """Leaves nerfstudio's training loop; not an Exception, so that nothing there catches it."""
 
 
 def run_nerfacto(trial: Trial, settings: Settings, data: Path) -> Run:
