@@ -8,8 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_folder import write_colmap
 from tiny import tiny_views
 
+from edge_se_sampler.data.capture import Capture
+from edge_se_sampler.data.colmap import read_colmap
+from edge_se_sampler.data.dataset import READERS
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.session import read_train_views, select_views
 from edge_se_sampler.errors import InputError
@@ -22,6 +26,21 @@ def test_num_views_picks_the_views_of_infonerfs_code() -> None:
     assert sorted(select_views(TrainerConfig(num_views=7), 7) or []) == list(range(7))
     assert select_views(TrainerConfig(), 7) is None
     assert select_views(TrainerConfig(views=(5, 0, 3)), 7) == [5, 0, 3]
+
+
+def test_points_are_those_of_the_chosen_views(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(folder: Path) -> Capture:
+        capture = read_colmap(folder)
+        return replace(capture, points=[np.full((1, 3), float(i)) for i in range(len(capture.frames))])
+
+    monkeypatch.setitem(READERS, "colmap", read)
+    write_colmap(tmp_path / "capture")
+    everything, few = (read_train_views(TrainerConfig(data=tmp_path / "capture", views=v)) for v in (None, (1, 0)))
+    assert everything.points is not None
+    assert few.points is not None
+    assert few.names == (everything.names[1], everything.names[0])
+    for found, expected in zip(few.points, (everything.points[1], everything.points[0]), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_a_subset_keeps_every_field() -> None:
@@ -40,6 +59,9 @@ def test_a_run_reads_only_the_chosen_views(scene: Path) -> None:
     few = read_train_views(TrainerConfig(data=scene, views=(2,)))
     assert few.names == everything.names[2:]
     assert len(read_train_views(TrainerConfig(data=scene, num_views=2)).names) == 2
+    first = scene / "train" / "r_0.png"
+    first.write_bytes(first.read_bytes()[:100])  # a header; no pixel, which nobody asks for
+    assert read_train_views(TrainerConfig(data=scene, views=(2,))).names == few.names
 
 
 @pytest.mark.parametrize(

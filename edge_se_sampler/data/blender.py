@@ -32,7 +32,7 @@ def read_blender(
     returned as written (not moved, scaled or orthonormalized). A frame without a mask is trained on as a whole.
     InputError for anything that cannot be used: first of the folder, then of the json, then of the images."""
     frames, top = list_frames(Path(folder), split)
-    views = load_views(frames, settings, progress)
+    views = load_views(settings.choose(frames), settings, progress)
     # real scenes, whose units are their own, state focal lengths in pixels alone
     depths = NERF_SYNTHETIC_DEPTHS if "camera_angle_x" in top.object() else None
     return replace(views, depths=depths, data_format="blender")

@@ -12,7 +12,7 @@ from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Capture, Split
 from edge_se_sampler.data.colmap import read_colmap
 from edge_se_sampler.data.colmap_model import find_model
 from edge_se_sampler.data.config import DataFormat, Masks
-from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, load_views
+from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
 from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.scene_file import SourceLocation, check_folder
@@ -41,6 +41,8 @@ class DataSettings:
     downscale: int = 1
     model_memory: ModelMemory = lambda *_: 0
     """What training takes of memory beside the images."""
+    select: Select = lambda _: None
+    """Which of a split's views are read."""
 
 
 def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
@@ -78,7 +80,7 @@ def read_split(
         "eval-every", settings.eval_every, settings.eval_every is None or settings.eval_every >= 2, "at least 2"
     )
     data_format = find_format(folder, settings.data_format)
-    load = LoadSettings(settings.masks, settings.downscale, settings.model_memory)
+    load = LoadSettings(settings.masks, settings.downscale, settings.model_memory, settings.select)
     if data_format == "blender":
         _check_unsplit(settings, has_own_split=True)
         if split != "train" and not has_split(folder, split):
@@ -89,6 +91,7 @@ def read_split(
         raise SourceLocation(folder).error("has no images to train on", "add some, or correct its lists")
     if not rows:
         return None
+    rows = load.choose(rows)
     views = load_views([capture.frames[i] for i in rows], load, progress)
     points = None if capture.points is None else tuple(capture.points[i] for i in rows)
     return replace(views, points=points, depths=None, data_format=data_format, eval_every=eval_every)

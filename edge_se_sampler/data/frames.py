@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from edge_se_sampler.errors import InputError
 
 Progress = Callable[[int, int], None]
 """Called with the number of images read so far, and of all."""
+Select = Callable[[int], Sequence[int] | None]
+"""Of so many views the indices of some, in an order; None: all."""
+T = TypeVar("T")
 MAX_MISFIT = 2**22
 """Pixels of a mask of another size than its image, up to which it is decoded: it may be damaged, too."""
 MAX_REMAPPED = 2**15 - 2
@@ -68,6 +72,13 @@ class LoadSettings:
     """Every so many pixels along both axes become one."""
     model_memory: ModelMemory = lambda *_: 0
     """What training takes of memory beside them."""
+    select: Select = lambda _: None
+    """Which of a split's views are read."""
+
+    def choose(self, views: Sequence[T]) -> Sequence[T]:
+        """The views that are read, of all of a split."""
+        indices = self.select(len(views))
+        return views if indices is None else [views[i] for i in indices]
 
 
 def read_headers(files: Sequence[SourceFile]) -> list[ImageHeader]:

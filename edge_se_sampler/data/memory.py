@@ -114,7 +114,7 @@ def _find_remedy(sizes: np.ndarray, downscale: int, model_memory: Callable[[int]
         if estimate_memory(sizes, enough, model_memory).total <= available:
             return f"give --downscale {enough}"
     largest = estimate_memory(sizes, downscale, model_memory)
-    return "give fewer images" if largest.model <= available else "train a smaller model"
+    return "give fewer images, as --num-views does" if largest.model <= available else "train a smaller model"
 
 
 def _format(size: int) -> str:

@@ -17,6 +17,7 @@ import torch
 from edge_se_sampler import ranks
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
+from edge_se_sampler.data.frames import Select
 from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import load_latest
@@ -179,10 +180,9 @@ def read_train_views(config: TrainerConfig) -> Views:
     """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
     if config.data is None:
         raise InputError("--data is missing: the folder to train on (edge-se scenes makes some)")
-    views = _read_split(config, "train", partial(_training_memory, config))
+    views = _read_split(config, "train", partial(_training_memory, config), partial(select_views, config))
     assert views is not None
-    selected = select_views(config, len(views.names))
-    return views if selected is None else views.subset(selected)
+    return views
 
 
 def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> int:
@@ -192,9 +192,11 @@ def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> in
     return decide_size(config.pipeline.model, longest).training_memory(has_alpha)
 
 
-def _read_split(config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda *_: 0) -> Views | None:
+def _read_split(
+    config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda *_: 0, select: Select = lambda _: None
+) -> Views | None:
     assert config.data is not None
-    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory)
+    settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory, select)
     with Progress(0, "reading images") as progress:
         return read_split(config.data, split, settings, progress.update)
 
