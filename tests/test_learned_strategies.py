@@ -69,6 +69,19 @@ def drawn_uniformly(batch: ImageBatch, count: int, seed: int) -> PixelBatch:
 # ---- what all of them do
 
 
+@pytest.mark.parametrize("name", LEARNED)
+def test_nothing_is_learnt_for_an_early_phase_that_is_over(name: str) -> None:
+    batch = batch_of(SAME)
+    sampler, _ = trained("uniform", 3, batch, following(0, early=name, late="uniform", images_per_step="all"))
+    assert sampler.needs_errors
+    assert f"{name}.distribution" in sampler.state_dict()
+    sampler.set_step(LATE)
+    sampler.sample(batch)
+    assert not sampler.needs_errors
+    assert sampler.pending_batch is None
+    assert f"{name}.distribution" not in sampler.state_dict()
+
+
 @pytest.mark.parametrize("images_per_step", ["one", "all"])
 @pytest.mark.parametrize("sizes", [SAME, MIXED])
 @pytest.mark.parametrize("name", LEARNED)

@@ -49,6 +49,7 @@ class ImportantPixels:
         self.pending_batch: PixelBatch | None = None
         """The last sample's pixels while their squared errors are wanted and not yet known, see `observe`."""
         self._squared_error: SquaredError | None = None
+        self._over: Distribution | None = None  # what is not drawn from any more
         self._step = TrainingStep(squared_error=self._score)
 
     def bind(
@@ -61,7 +62,7 @@ class ImportantPixels:
             progress: of the training, which a share of it as the early phase follows.
             rank: of this process among `world` of a distributed run, see `TrainingStep`.
         """
-        self._squared_error = squared_error
+        self._squared_error, self._over = squared_error, None
         self._step = replace(self._step, seed=seed, rank=rank, world=world)
         if self.config.schedule == "adaptive":
             self.schedule = AdaptiveSchedule(self.strategies[self.config.early].distribution)
@@ -144,20 +145,21 @@ class ImportantPixels:
             parts[name].load_state_dict(part_state)
 
     def parts(self) -> dict[str, SamplerPart]:
-        """Everything that may learn from errors, by its name in a checkpoint."""
+        """Everything that may yet learn from errors, by its name in a checkpoint."""
         parts: dict[str, SamplerPart] = {"schedule": self.schedule}
         for name, strategy in self.strategies.items():
             parts |= {f"{name}.distribution": strategy.distribution, f"{name}.selector": strategy.selector}
-        return parts
+        return {name: part for name, part in parts.items() if part is not self._over}
 
     def _read(self, image_batch: dict[str, Any]) -> ImageBatch:
         return ImageBatch.of(image_batch, use_mask=not self.config.ignore_mask, background_color=self.background_color)
 
     def _release_tables(self, needed: Distribution) -> None:
-        """Give back the memory of the early phase's tables once it is over for good."""
+        """Give back the memory of the early phase's tables, and learn no more for it, once it is over for good."""
         early = self.strategies[self.config.early].distribution
         if not self.schedule.early_may_return and early not in (needed, self.strategies[Uniform.name].distribution):
             early.clear()
+            self._over = early
 
     def _score(self, candidates: PixelBatch) -> Tensor:
         """The model's squared errors (m,) at candidates. They are learnt from as well, being drawn uniformly, and more
