@@ -43,7 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _exit(str(problem), 1)
     except OSError as problem:  # of files that are no output: standard output's, the cache of compiled kernels
         if problem.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
+            if problem.filename is None:
+                raise
+            _exit(f"{problem.filename}: cannot be used ({problem.strerror})", 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left there is not tried again
         _exit(f"{problem.filename or 'a file'}: cannot be written ({problem.strerror})", 2)
     except (MemoryError, RuntimeError) as problem:

@@ -160,6 +160,32 @@ def test_a_split_of_the_data(tmp_path: Path) -> None:
         read(tmp_path)
 
 
+def test_an_ending_tells_listed_files_apart(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    first, second = document["frames"][:2]
+    kept = tmp_path / first["file_path"]
+    (tmp_path / second["file_path"]).rename(kept.with_suffix(".jpg"))
+    second["file_path"] = str(Path(first["file_path"]).with_suffix(".jpg"))
+    document |= {"train_filenames": [first["file_path"]], "test_filenames": [second["file_path"]]}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert read(tmp_path).names == (first["file_path"],)
+    assert read(tmp_path, "test").names == (second["file_path"],)
+
+
+def test_a_text_model_may_have_no_points_and_odd_names(tmp_path: Path) -> None:
+    write_colmap(tmp_path, text=True)
+    (tmp_path / "sparse/0/points3D.txt").write_bytes(b"")
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images_2" / NAMES[1]).rename(tmp_path / "images_2" / "view 01\u2028.png")
+    listed = tmp_path / "sparse/0/images.txt"
+    listed.write_text(listed.read_text().replace(NAMES[1], "view 01\u2028.png").replace("\n", "\r\n"), newline="")
+    views = read(tmp_path)
+    assert "view 01\u2028.png" in views.names
+    assert len(views.names) == 7
+    assert views.points is None
+
+
 def test_images_that_do_not_exist_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_colmap(tmp_path)
     for name in NAMES[:4]:

@@ -267,6 +267,11 @@ class TestRuns:
         assert "--outputs" in refused(edge_se, run, "render", run, "--outputs", "rgb", "rgb")
         for path in (".", tmp_path):
             assert "must name a file" in refused(edge_se, run, "eval", run, "--output-path", path)
+        os.mkfifo(tmp_path / "pipe")
+        assert "no regular file" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "pipe")
+        assert (tmp_path / "pipe").is_fifo()
+        for flag in ("--output-path", "--camera-path"):
+            assert "name too long" in refused(edge_se, run, "render", run, flag, tmp_path / (300 * "a" + ".gif"))
 
     def test_with_damaged_metrics(self, run: Path, edge_se):
         for content in ('{"loss": 1}\n', "no json\n", '{"step": "a"}\n'):

@@ -148,6 +148,15 @@ def test_the_datas_own_json_is_not_overwritten(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "transforms.json").read_text()) == transforms()
 
 
+def test_blender_lists_are_not_overwritten(tmp_path: Path) -> None:
+    write_scene(tmp_path)
+    before = (tmp_path / "transforms_train.json").read_bytes()
+    for name in ("transforms_train.json", "transforms_val.json"):
+        with pytest.raises(InputError, match="not overwritten"):
+            export_cameras(config_of(tmp_path, "auto"), tmp_path / name)
+    assert (tmp_path / "transforms_train.json").read_bytes() == before
+
+
 def test_data_that_is_gone_is_an_error(tmp_path: Path, edge_se: Callable) -> None:
     run = ball_run(tmp_path)
     write_json(tmp_path / "scene", {"fl_x": 9, "frames": []})

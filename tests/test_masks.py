@@ -232,6 +232,23 @@ def test_the_picture_does_not_take_the_masks_place(tmp_path: Path, images: list[
     assert not (tmp_path / "scene" / "masks").exists()
 
 
+def test_no_two_images_have_one_mask(tmp_path: Path, images: list[np.ndarray], edge_se: Any) -> None:
+    scene = tmp_path / "ring"
+    write_capture(scene, images)
+    document = json.loads((scene / "transforms.json").read_text())
+    first = scene / document["frames"][0]["file_path"]
+    first.rename(scene / first.name)
+    document["frames"][0]["file_path"] = first.name
+    other = scene / document["frames"][1]["file_path"]
+    other.rename(other.with_name(first.name))
+    document["frames"][1]["file_path"] = f"images/{first.name}"
+    (scene / "transforms.json").write_text(json.dumps(document))
+    answer = edge_se("masks", "--data", scene)
+    assert answer.code == 2, answer
+    assert f"2 images would have the mask masks/{first.name}.png" in answer.err
+    assert not (scene / "masks").exists()
+
+
 def test_masks_lie_where_colmap_has_them(tmp_path: Path) -> None:
     folder = tmp_path.resolve()
     for image, mask in (

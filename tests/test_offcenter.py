@@ -188,6 +188,16 @@ class TestCameras:
             np.testing.assert_array_equal(focal_lengths(views), [[10.1, 11.5], [20.25, 11.5], [10.1, 11.5]])
             np.testing.assert_array_equal(principal_points(views) - corner, [[2.5, 2], [2.5, 1.75], [2.5, 2]])
 
+    @pytest.mark.parametrize("angle", ["camera_angle_x", "camera_angle_y"])
+    def test_angles_of_frames_are_of_the_source_alone(self, angle: str, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        for i in range(3):
+            doc["frames"][i][angle] = 0.7
+        write_json(tmp_path / "scene", doc)
+        before = read_blender(tmp_path / "scene", "train")
+        for folder, _ in copies_of(tmp_path / "scene"):
+            np.testing.assert_allclose(focal_lengths(read_blender(folder, "train")), focal_lengths(before), rtol=1e-14)
+
     def test_views_of_different_sizes_get_no_common_angle(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")
         iio.imwrite(tmp_path / "scene/train/r_1.png", pixels(7, 10, 8))

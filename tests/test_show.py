@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from capture_folder import NAMES, bounds, write_llff
 from tiny import tiny_views
 
 from edge_se_sampler.data.datamanager import image_batch
@@ -120,6 +122,16 @@ def test_alpha_edges_without_alpha_are_refused_with_the_views_name(tmp_path: Pat
     with pytest.raises(InputError, match=r"view 0': .*alpha"):
         draw(tmp_path / "x.png", tiny_views(1, HEIGHT, WIDTH, channels=3), edge_source="alpha")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_name_that_is_no_utf_8_is_shown(tmp_path: Path, edge_se: Any) -> None:
+    write_llff(tmp_path / "scene", bounds())
+    first = tmp_path / "scene" / "images" / NAMES[1]
+    first.rename(Path(os.fsdecode(os.fsencode(first.with_suffix("")) + b"\xe9.png")))
+    for command in ("show", "inspect"):
+        answer = edge_se(command, "--data", tmp_path / "scene", "--output-path", tmp_path / f"{command}.png")
+        assert answer.code == 0, answer
+        assert (tmp_path / f"{command}.png").exists()
 
 
 def test_without_matplotlib_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

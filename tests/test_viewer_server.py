@@ -64,7 +64,11 @@ def test_a_port_that_is_taken_is_named(run: Path, edge_se) -> None:
 
 @pytest.mark.parametrize(
     ("flags", "named"),
-    [(("--port", "70000"), "70000"), (("--host", "no.such.host.invalid"), "no.such.host.invalid")],
+    [
+        (("--port", "70000"), "70000"),
+        (("--host", "no.such.host.invalid"), "no.such.host.invalid"),
+        (("--host", ".."), "--host '..'"),
+    ],
 )
 def test_an_address_that_is_none_is_refused(run: Path, edge_se, flags: tuple[str, str], named: str) -> None:
     answer = edge_se("view", run, *flags)

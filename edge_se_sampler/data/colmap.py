@@ -54,9 +54,9 @@ def read_colmap(folder: Path) -> Capture:
 
 
 def find_images(folder: Path) -> Path:
-    """The first of FOLDERS that there is; InputError if there is none."""
+    """The first of FOLDERS that has something; InputError if there is none."""
     for name in FOLDERS:
-        if (folder / name).is_dir():
+        if os.path.isdir(folder / name) and any(os.scandir(folder / name)):
             locate_file(folder, name, SourceLocation(folder))
             return folder / name
     raise SourceLocation(folder).error("has no images", f"put them into {', '.join(FOLDERS[:-1])} or {FOLDERS[-1]}")

@@ -95,6 +95,8 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if not any((model / f"points3D.{suffix}").exists() for suffix in ("bin", "txt")):
         return None
     path = _file_of(model, "points3D")
+    if path.suffix == ".txt" and path.stat().st_size == 0:  # as COLMAP has it where poses are known
+        return None
     records = list((_text_points if path.suffix == ".txt" else _binary_points)(path))
     ids = np.array([number for number, _ in records], dtype=np.int64)
     positions = np.array([position for _, position in records], dtype=np.float64).reshape(-1, 3)
@@ -233,9 +235,9 @@ def _lines(path: Path) -> Iterator[tuple[SourceLocation, str]]:
     """The lines of a text file that are no comments."""
     location = SourceLocation(path)
     text = _decode(SourceFile(path, location).read_bytes(), location)
-    for i, line in enumerate(text.splitlines()):
+    for i, line in enumerate(text.split("\n")):  # names may have what else `splitlines` splits at
         if not line.startswith("#"):
-            yield SourceLocation(path, f"line {i + 1}"), line
+            yield SourceLocation(path, f"line {i + 1}"), line.rstrip("\r")
 
 
 def _numbers(location: SourceLocation, words: list[str]) -> list[float]:

@@ -34,6 +34,7 @@ from edge_se_sampler.errors import InputError
 
 Pair = tuple[int, int]  # x, y
 Fractions = tuple[float, float]  # of an image's width and height
+ANGLES = "camera_angle_x", "camera_angle_y"  # of narrower and lower images than a copy's
 Files = list[dict[str, str]]  # of each frame: file_path, mask_path -> the file inside a copy
 
 
@@ -223,9 +224,10 @@ def _document(
             top["camera_angle_x"] = 2 * math.atan(math.tan(top["camera_angle_x"] / 2) * widened)
         else:
             del top["camera_angle_x"]  # no one angle is true of all
+    top.pop("camera_angle_y", None)
     del top["frames"]
     top["frames"] = [
-        frame
+        {key: value for key, value in frame.items() if key not in ANGLES}
         | {key: value for key, value in own.items() if key in frame or key not in shared}
         | {key: file for key, file in written.items() if not _is_listed_png(frame.get(key))}
         for frame, own, written in zip(source["frames"], intrinsics, files, strict=True)

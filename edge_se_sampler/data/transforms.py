@@ -43,19 +43,22 @@ def read_transforms(folder: Path) -> Capture:
 
 def _key(path: str) -> str:
     """One name for all spellings of a listed file."""
-    return os.path.splitext(os.path.normpath(listed_file(path)))[0]
+    return os.path.normpath(listed_file(path))
 
 
 def _read_splits(top: JsonValue, entries: list[Entry]) -> dict[Split, set[str]] | None:
     """The files of each split; None if the json does not split them. What is in no list is trained on where there is
     no list of what is."""
     known = {_key(entry.file_path) for entry in entries}
+    by_stem = {os.path.splitext(key)[0]: key for key in known}  # whose ending a list may leave out
     splits: dict[Split, set[str]] = {}
     of: dict[str, str] = {}
     for split in SPLITS:
         value = top.optional(f"{split}_filenames")
         for name in [] if value is None else value.list():
             key = _key(name.file_path())
+            if key not in known:
+                key = by_stem.get(os.path.splitext(key)[0], key)
             if key not in known:
                 raise name.location.error(f"{quote(name.value)} is the file of no frame", "list files of frames")
             if "train" in (of.setdefault(key, split), split) and of[key] != split:

@@ -21,6 +21,11 @@ def require_pyplot():
     return pyplot
 
 
+def printable(name: str) -> str:
+    """A file's name as text that can be drawn: what is no UTF-8 in it is escaped."""
+    return name.encode(errors="backslashreplace").decode()
+
+
 def style_axes(*axes) -> None:
     for axis in axes:
         axis.grid(alpha=0.25)

@@ -40,9 +40,11 @@ def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) ->
 
 def check_output(path: Path, flag: str = "--output-path") -> None:
     """Check that a file, named by a flag, can be written: its folder must exist."""
-    if not path.name or path.is_dir():
+    if not path.name or os.path.isdir(path):
         raise InputError(f"{flag} {path}: must name a file, not a folder")
-    if not path.parent.is_dir():
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(f"{flag} {path}: is no regular file, and would be replaced by one; name another")
+    if not os.path.isdir(path.parent):
         raise InputError(f"{flag} {path}: no such folder {path.parent}")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{flag} {path}: {path.parent} cannot be written")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.figures import require_pyplot, save_figure
+from edge_se_sampler.engine.figures import printable, require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
@@ -55,7 +55,7 @@ def inspect(views: Views, config: LeanModelConfig, path: Path) -> str:
         color = composite_on(unit_float(views.images[k]))
         axis.imshow(np.where(hit_pixels[k][..., None], color, 0.25 * color), interpolation="nearest")
         axis.set(xticks=[], yticks=[])
-        axis.set_title(views.names[k], fontsize=9, parse_math=False)
+        axis.set_title(printable(views.names[k]), fontsize=9, parse_math=False)
     figure.tight_layout(rect=(0, 0, 1, 0.96))
     save_figure(figure, path)
     return "\n".join(

@@ -158,7 +158,8 @@ def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayM
 def read_test_views(config: TrainerConfig) -> Views:
     """The held-out views of a run: its test split, or val where there is no test; InputError if there is neither."""
     if config.data is None or not config.data.is_dir():
-        raise InputError(f"{config.data}: no such folder, where this run's held-out views were")
+        remedy = 'put them back, or write where they are as "data" into its config.json, without its "checksum"'
+        raise InputError(f"{config.data}: no such folder, where this run's held-out views were; {remedy}")
     views = _read_first_split(config, ("test", "val"))
     if views is None:
         remedy = "transforms_test.json, transforms_val.json or another list of test images is needed"

@@ -10,7 +10,7 @@ import torch
 from edge_se_sampler.data.datamanager import image_batch
 from edge_se_sampler.data.scene_file import quote
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.figures import require_pyplot, save_figure
+from edge_se_sampler.engine.figures import printable, require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.distribution import PixelTable
@@ -59,7 +59,7 @@ def _show_view(axes, views: Views, k: int, p: np.ndarray, strategy: str, count: 
     image = unit_float(views.images[k])
     height, width = p.shape
     axes[0].imshow(composite_on(image), interpolation="nearest")
-    axes[0].set_title(f"view {k}: {views.names[k]}", fontsize=9, parse_math=False)
+    axes[0].set_title(f"view {k}: {printable(views.names[k])}", fontsize=9, parse_math=False)
     relative = p * max(np.count_nonzero(p), 1)
     shown = axes[1].imshow(relative, cmap="magma", interpolation="nearest", vmin=0)
     axes[1].set_title(f"{strategy}: probability, 1 = uniform", fontsize=9)

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from edge_se_sampler.data.blender import transforms_path as blender_path
 from edge_se_sampler.data.capture import SPLITS
-from edge_se_sampler.data.dataset import DataSettings, list_frames
+from edge_se_sampler.data.dataset import DataSettings, find_format, list_frames
 from edge_se_sampler.data.frames import Frame
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
@@ -28,7 +29,12 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
         raise InputError(f"--output-path {path}: must end in .json")
     check_output(path)
     assert config.data is not None  # the config is resolved
-    if path.resolve() == transforms_path(config.data).resolve() and config.data_format == "transforms":
+    lists = [transforms_path(config.data)]
+    if find_format(config.data, config.data_format) == "blender":
+        lists = [blender_path(config.data, split) for split in SPLITS]
+    elif config.data_format != "transforms":
+        lists = []
+    if os.path.realpath(path) in map(os.path.realpath, lists):
         raise InputError(f"--output-path {path}: the data itself, which is not overwritten; give another file")
     settings = DataSettings(config.data_format, eval_every=config.eval_every)
     splits = {split: list_frames(config.data, split, settings) for split in SPLITS}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -45,8 +47,12 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
     out = folder if out is None else out
     frames = _frames(folder, settings)
     places = [_place(folder, frame) for frame in frames]
+    for place, count in Counter(places).items():
+        if count > 1:
+            problem = f"{count} images would have the mask {place.relative_to(folder)}"
+            raise SourceLocation(folder).error(problem, "give images that lie in different folders names of their own")
     targets = sorted({out / place.relative_to(folder).parts[0] for place in places})
-    if picture.resolve() in {target.resolve() for target in targets}:
+    if os.path.realpath(picture) in map(os.path.realpath, targets):
         raise InputError(f"--output-path {picture}: the masks' folder is to be there; name another file")
     with staged_folders(out, targets) as workspace:
         images = _read_images(frames)

@@ -9,6 +9,7 @@ import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 
+from edge_se_sampler.data.scene_file import quote
 from edge_se_sampler.errors import InputError, check_value
 
 
@@ -28,6 +29,8 @@ class ViewerConfig:
         try:
             family, _, _, _, address = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0]
             socket.create_server(address, family=family).close()
+        except UnicodeError:
+            raise InputError(f"--host {quote(self.host)}: is no name or address; give this machine's") from None
         except OSError as problem:
             if problem.errno == errno.EADDRINUSE:
                 raise self.taken() from None

@@ -65,7 +65,8 @@ def open_viewer(viewed: Viewed, address: ViewerConfig) -> Iterator[viser.ViserSe
             if client.client_id in panels:
                 panels.pop(client.client_id).close()
 
-        print(f"viewer   http://{address.host}:{server.get_port()}  (Ctrl-C ends it)", flush=True)
+        host = f"[{address.host}]" if ":" in address.host else address.host
+        print(f"viewer   http://{host}:{server.get_port()}  (Ctrl-C ends it)", flush=True)
         try:
             yield server
         finally:
