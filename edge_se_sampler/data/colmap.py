@@ -56,7 +56,7 @@ def read_colmap(folder: Path) -> Capture:
 def find_images(folder: Path) -> Path:
     """The first of FOLDERS that has something; InputError if there is none."""
     for name in FOLDERS:
-        if os.path.isdir(folder / name) and any(os.scandir(folder / name)):
+        if os.path.isdir(folder / name) and os.listdir(folder / name):
             locate_file(folder, name, SourceLocation(folder))
             return folder / name
     raise SourceLocation(folder).error("has no images", f"put them into {', '.join(FOLDERS[:-1])} or {FOLDERS[-1]}")
