@@ -243,7 +243,7 @@ def test_no_two_images_have_one_mask(tmp_path: Path, images: list[np.ndarray], e
     other.rename(other.with_name(first.name))
     document["frames"][1]["file_path"] = f"images/{first.name}"
     (scene / "transforms.json").write_text(json.dumps(document))
-    answer = edge_se("masks", "--data", scene)
+    answer = edge_se("masks", "--data", scene, "--output-path", tmp_path / "masks.png")
     assert answer.code == 2, answer
     assert f"2 images would have the mask masks/{first.name}.png" in answer.err
     assert not (scene / "masks").exists()
