@@ -143,8 +143,9 @@ def test_the_views_that_were_trained_on_are_listed(tmp_path: Path) -> None:
 
 def test_the_datas_own_json_is_not_overwritten(tmp_path: Path) -> None:
     write_transforms(tmp_path)
-    with pytest.raises(InputError, match="not overwritten"):
-        export_cameras(config_of(tmp_path, "transforms"), tmp_path / "images" / ".." / "transforms.json")
+    for data_format in ("transforms", "auto"):
+        with pytest.raises(InputError, match="not overwritten"):
+            export_cameras(config_of(tmp_path, data_format), tmp_path / "images" / ".." / "transforms.json")
     assert json.loads((tmp_path / "transforms.json").read_text()) == transforms()
 
 

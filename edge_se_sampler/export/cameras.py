@@ -29,11 +29,10 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
         raise InputError(f"--output-path {path}: must end in .json")
     check_output(path)
     assert config.data is not None  # the config is resolved
-    lists = [transforms_path(config.data)]
-    if find_format(config.data, config.data_format) == "blender":
-        lists = [blender_path(config.data, split) for split in SPLITS]
-    elif config.data_format != "transforms":
-        lists = []
+    lists = {
+        "blender": [blender_path(config.data, split) for split in SPLITS],
+        "transforms": [transforms_path(config.data)],
+    }.get(find_format(config.data, config.data_format), [])
     if os.path.realpath(path) in map(os.path.realpath, lists):
         raise InputError(f"--output-path {path}: the data itself, which is not overwritten; give another file")
     settings = DataSettings(config.data_format, eval_every=config.eval_every)
