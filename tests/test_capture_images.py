@@ -94,9 +94,17 @@ def test_masks_of_images_that_are_links_are_where_they_were_written(kind: str, t
 
 
 def test_masks_as_objects_where_there_are_none(tmp_path: Path) -> None:
+    """Where only the held-out views have none, it says which those are."""
     write_transforms(tmp_path)
-    with pytest.raises(InputError, match="neither masks nor alpha"):
-        read(tmp_path, masks="object")
+    held_out = read(tmp_path, "test").names
+    for image in (tmp_path / "images").iterdir():
+        if image.name not in {Path(name).name for name in held_out}:
+            mask = place_of_mask(tmp_path, image)
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            iio.imwrite(mask, half_mask())
+    assert read(tmp_path, masks="object").images[0].shape[2] == 4
+    with pytest.raises(InputError, match=f"{re.escape(held_out[0])}.*neither masks nor alpha"):
+        read(tmp_path, "test", masks="object")
 
 
 def test_rays_of_downscaled_images(tmp_path: Path) -> None:

@@ -169,3 +169,19 @@ def test_every_command_takes_the_checkpoint_before_a_damaged_one(
         answer = edge_se(command, trained, *flags.get(command, []))
         assert (answer.code, answer.err.count("\n")) == (2, 1)
         assert "truncated or changed" in answer.err
+
+
+@pytest.mark.parametrize("command", ["eval", "resume"])
+def test_a_run_whose_data_has_moved_is_mended_as_its_message_says(
+    command: str, trained: Path, tmp_path: Path, edge_se
+) -> None:
+    flags = {"eval": ["--output-path", tmp_path / "eval.json"], "resume": ["--max-num-iterations", 7]}[command]
+    written = json.loads((trained / "config.json").read_text())
+    moved = Path(written["data"]).rename(tmp_path / "moved")
+    answer = edge_se(command, trained, *flags)
+    assert (answer.code, answer.err.count("\n")) == (2, 1)
+    assert all(word in answer.err for word in (written["data"], "config.json", '"data"', '"checksum"'))
+    del written["checksum"]
+    (trained / "config.json").write_text(json.dumps(written | {"data": str(moved)}))
+    answer = edge_se(command, trained, *flags)
+    assert answer.code == 0, answer.err

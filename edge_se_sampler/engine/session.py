@@ -112,6 +112,7 @@ def prepare_resume(
         config = _extend(config, state, max_num_iterations)
     session_config = replace(config, max_seconds=max_seconds)
     session_config.check()
+    _check_run_data(config)
     trainer = prepare(session_config, run, saved_grid(state["model"]))
     trainer.resume(state, changed_data)
     if ranks.is_main():
@@ -157,14 +158,18 @@ def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayM
 
 def read_test_views(config: TrainerConfig) -> Views:
     """The held-out views of a run: its test split, or val where there is no test; InputError if there is neither."""
-    if config.data is None or not config.data.is_dir():
-        remedy = 'put them back, or write where they are as "data" into its config.json, without its "checksum"'
-        raise InputError(f"{config.data}: no such folder, where this run's held-out views were; {remedy}")
+    _check_run_data(config)
     views = _read_first_split(config, ("test", "val"))
     if views is None:
         remedy = "transforms_test.json, transforms_val.json or another list of test images is needed"
         raise InputError(f"{config.data}: no held-out views; {remedy}")
     return views
+
+
+def _check_run_data(config: TrainerConfig) -> None:
+    if config.data is None or not config.data.is_dir():
+        remedy = 'put it back, or write where it is as "data" into its config.json, without its "checksum"'
+        raise InputError(f"{config.data}: no such folder, where this run's data was; {remedy}")
 
 
 def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views | None:
