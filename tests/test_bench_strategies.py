@@ -240,10 +240,10 @@ def test_numbers_are_those_of_brute_force() -> None:
 @pytest.mark.parametrize(
     ("psnrs", "verdict", "use"),
     [
-        ((27.0, 27.1, 27.2), "better", "yes, better: lean, 200 px"),
+        ((27.0, 27.1, 27.2), "better", "yes, better: lean (200 px)"),
         ((25.4, 25.5, 25.3), "same", "no need, not distinguishable in 1 of 1"),
         ((26.0, 26.1, 26.2), "same", "no need, not distinguishable in 1 of 1"),  # so does that of uniform
-        ((23.0, 23.1, 23.2), "worse", "no, worse: lean, 200 px"),
+        ((23.0, 23.1, 23.2), "worse", "no, worse: lean (200 px)"),
         ((29.0,), None, "no verdict (one seed) in 1 of 1"),
         ((24.0, 27.0, 27.1), "same", "no need, not distinguishable in 1 of 1"),  # its own spread counts
     ],
@@ -276,11 +276,16 @@ def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
         for seed, offset in enumerate(offsets):
             more = {"downscale": downscale, "size": [800 // downscale] * 2}
             runs += [run_of(25 + seed / 10, seed, **more), run_of(25 + offset, seed, "edge", **more)]
-    expected = "yes, better: lean, 200 px; worse: lean, 100 px; not distinguishable in 1 of 4"
+    expected = "yes, better: lean (200 px); worse: lean (100 px); not distinguishable in 1 of 4"
     assert describe_use(runs, "edge") == f"{expected}; no verdict (one seed) in 1 of 4"
     less = [run for run in runs if run["downscale"] >= 8]
-    assert describe_use(less, "edge") == "no, worse: lean, 100 px; not distinguishable in 1 of 2"
+    assert describe_use(less, "edge") == "no, worse: lean (100 px); not distinguishable in 1 of 2"
     assert describe_use(less, "se") == "–"
+    worse = [run for run in runs if run["downscale"] == 8]
+    moved = [run | {"placement": "shifted"} for run in worse]
+    nerf = [run | {"model": "nerf"} for run in (*worse, *(run for run in runs if run["downscale"] == 16))]
+    expected = "no, worse: nerf (100 px), lean; not distinguishable in 1 of 4"
+    assert describe_use([*worse, *moved, *nerf], "edge") == expected
 
 
 def test_images_of_another_size_are_compared_apart() -> None:
@@ -331,7 +336,7 @@ def test_the_page_shows_the_numbers(tmp_path: Path) -> None:
     )
     assert "| uniform | 25.10 (0.20) | – | – | – | 25.00 | – | – | – | x1.00 | 2 of 4 |" in page
     assert "| lean, 200 px | edge | +1.10 | better |" in page
-    assert "| lean +1.10, a step x2.00 | yes, better: lean, 200 px |" in tables(tmp_path)["strategies"]
+    assert "| lean +1.10, a step x2.00 | yes, better: lean (200 px) |" in tables(tmp_path)["strategies"]
     assert "broken" in page
     assert "10 s or 800 steps" in page
     assert "ended in an error" not in describe(folder_of(tmp_path, runs))

@@ -149,8 +149,9 @@ def load_views(
             progress(len(images), len(frames))
     find_sources.cache_clear()
     if settings.masks == "object" and all(image.shape[2] == 3 for image in images):
-        problem = f"{quote(frames[0].name)} and the {len(frames) - 1} other views of its split have neither masks nor alpha"
-        raise listing.error(f"{problem} for --masks object", "add masks, or leave the flag out")
+        those = f"{quote(frames[0].name)} and the {len(frames) - 1} other views of its split"
+        problem = f"{those} have neither masks nor alpha for --masks object"
+        raise listing.error(problem, "add masks, or leave the flag out")
     has_masks = any(mask is not None for mask in masks)
     if has_masks:
         masks = [np.ones(i.shape[:2], dtype=bool) if m is None else m for i, m in zip(images, masks, strict=True)]

@@ -103,12 +103,30 @@ def describe_use(runs: list[Run], strategy: str) -> str:
     if not judged:
         return "–"
     texts = [
-        f"{VERDICTS[verdict]}: {' and '.join(where[verdict])}"
+        f"{VERDICTS[verdict]}: {_name_panels(where[verdict], list(found))}"
         if verdict in ("better", "worse")
         else f"{VERDICTS[verdict]} in {len(where[verdict])} of {len(found)}"
         for verdict in judged
     ]
     return ANSWERS[judged[0]] + "; ".join(texts)
+
+
+def _name_panels(some: list[str], compared: list[str]) -> str:
+    """Of those labels the models, each with its panels; without them where they are all of several compared ones."""
+    places, of_all = _group_by_model(some), _group_by_model(compared)
+    return ", ".join(
+        model if len(found) == len(of_all[model]) > 1 else f"{model} ({'; '.join(found)})"
+        for model, found in places.items()
+    )
+
+
+def _group_by_model(labels: list[str]) -> dict[str, list[str]]:
+    """Model -> the rest of its panels' labels."""
+    groups: dict[str, list[str]] = {}
+    for label in labels:
+        model, _, place = label.partition(", ")
+        groups.setdefault(model, []).append(place)
+    return groups
 
 
 def _compare_everywhere(runs: list[Run], strategy: str) -> dict[str, Comparison]:
