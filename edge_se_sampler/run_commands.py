@@ -187,9 +187,9 @@ def train(trainer: Any) -> None:
         print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
         sys.exit(130)
     print(f"{trainer.next_step} of {trainer.plan.num_steps or '?'} iterations in {trainer.elapsed:.1f} s of training")
-    stopping = trainer.early_stopping
-    if stopping.is_due:
+    stopping, has_ended = trainer.early_stopping, trainer.next_step == trainer.plan.num_steps
+    if stopping.is_due and not has_ended:
         print(f"stopped: no gain of {stopping.min_gain:g} dB in the last {stopping.patience} previews")
     print(f"measure it: edge-se eval {quote(str(trainer.run.path))}")
-    if trainer.next_step != trainer.plan.num_steps:
+    if not has_ended:
         print(f"continue:   {resume}")

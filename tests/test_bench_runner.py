@@ -202,6 +202,24 @@ def test_listing_trials_trains_and_writes_nothing(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "new").exists()
 
 
+def test_flags_that_choose_nothing_are_refused(tmp_path: Path) -> None:
+    run_experiment(toy_experiment(), tmp_path / "old", one_thread, Shard(1, 2))
+    for folder in (tmp_path / "old", tmp_path / "new"):
+        for call in (list_trials, lambda experiment, folder: run_experiment(experiment, folder, one_thread)):
+            with pytest.raises(InputError, match="bench toy: there is no training"):
+                call(toy_experiment(trials=lambda _: []), folder)
+    assert not (tmp_path / "new").exists()
+    assert not (tmp_path / "old" / "result.json").exists()
+
+
+def test_what_is_chosen_twice_is_one_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    experiment = toy_experiment(trials=lambda _: [*TRIALS, *TRIALS])
+    list_trials(experiment, tmp_path)
+    assert capsys.readouterr().out.endswith("mic | 2\n3 trainings, 3 of them pending\n")
+    shards = [run_experiment(experiment, tmp_path, one_thread, Shard(number, 2))["runs"] for number in (1, 2)]
+    assert [[run["seed"] for run in runs] for runs in shards] == [[0, 2], [0, 1, 2]]
+
+
 # -- shards
 
 

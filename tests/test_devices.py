@@ -44,6 +44,7 @@ def test_the_device_that_is_chosen(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: "cuda" in found)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: "mps" in found)
+    assert choose_device(device_type, of_run=True) == (expected or "cpu")
     if expected is not None:
         assert choose_device(device_type) == expected
         return

@@ -17,7 +17,14 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on
-from edge_se_sampler.engine.rendering import Picture, measure_psnr, render_rays, render_view, to_pictures
+from edge_se_sampler.engine.rendering import (
+    Picture,
+    measure_psnr,
+    render_opaque,
+    render_rays,
+    render_view,
+    to_pictures,
+)
 from edge_se_sampler.models import nerf as model_module
 from edge_se_sampler.models.ensemble import Ensemble
 from edge_se_sampler.models.nerf import NeRFModel
@@ -193,3 +200,13 @@ def test_an_ensemble_renders_the_mean_of_its_members() -> None:
         each = torch.stack([render_rays(member, rays, key) for member in members])
         torch.testing.assert_close(render_rays(ensemble, rays, key), each.mean(dim=0))
         assert (each.std(dim=0).min() > 0.01) == (key != "background")
+
+
+def test_depths_of_an_ensemble_are_before_the_background_of_its_first_member() -> None:
+    """What is behind a ray is removed from it, wherever each member has it."""
+    first, second = (with_constant_density(model_of(far=far), -1.0) for far in (6.0, 9.0))
+    rays = to_pictures(tiny_views(1, HEIGHT, WIDTH))[0].rays(first.device)
+    each = [render_opaque(member, rays) for member in (first, second)]
+    seen = [distance * opacity for _, distance, opacity in each]
+    _, distance, opacity = render_opaque(Ensemble([first, second]), rays)
+    torch.testing.assert_close(distance * opacity, (seen[0] + seen[1]) / 2, rtol=1e-4, atol=1e-4)

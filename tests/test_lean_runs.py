@@ -64,6 +64,22 @@ def test_a_time_budget_is_kept_and_its_plan_repeats_it_bit_for_bit(
     assert resumed.next_step == first.next_step
 
 
+def test_a_time_budget_is_kept_where_a_resumed_run_is_set_up_sooner(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = override(config_of(None), {"data": scene, "output_dir": tmp_path, "machine.device_type": "cpu"})
+    with monkeypatch.context() as patch:
+        patch.setattr("time.monotonic", itertools.count(0, 0.01).__next__)
+        first = prepare(override(config, {"time_budget": "6s", "max_seconds": 1.0}))
+        first.setup_seconds = 2.0
+        first.train()
+        assert 0 < first.plan.progress(first.next_step) < 1
+        resumed = prepare_resume(first.run, RunFolder(first.run.path).config(method_configs()), max_seconds=10)
+        resumed.train()
+    assert resumed.setup_seconds == 2
+    assert resumed.elapsed == pytest.approx(4, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

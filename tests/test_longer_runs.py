@@ -88,6 +88,8 @@ def test_patience_ends_without_a_gain_over_the_best(values: list[float], due_at:
         stopping = restored
         stopping.update(value)
         due.append(stopping.is_due)
+        if stopping.is_due:
+            break
     assert (due.index(True) if any(due) else None) == due_at
 
 
@@ -100,7 +102,17 @@ def test_a_training_without_gain_is_ended_and_can_go_on(scene: Path, tmp_path: P
     assert f"edge-se resume {run}" in answer.out
     assert latest_checkpoint(run / "checkpoints").name == "step-000000003.ckpt"
     assert len(lines_with(run, "val_psnr")) == 4
-    assert "5 of 6 iterations" in edge_se("resume", run).out  # the patience that it had is still lost
+    assert "stopped: no gain" in answer.out
+    answer = edge_se("resume", run)  # with new patience
+    assert "6 of 6 iterations" in answer.out
+    assert "stopped" not in answer.out
+
+
+def test_what_ends_by_itself_was_not_stopped(scene: Path, tmp_path: Path, edge_se) -> None:
+    flags = ["--patience", 1, "--min-gain", 90, "--steps-per-eval-image", 3, "--output-dir", tmp_path / "o"]
+    answer = edge_se("train", "edge-nerf", "--data", scene, *SMALL, *flags)
+    assert "6 of 6 iterations" in answer.out
+    assert "stopped" not in answer.out
 
 
 @pytest.mark.parametrize("flags", [("--patience", 0), ("--min-gain", -1), ("--min-gain", "nan")])

@@ -139,6 +139,8 @@ def test_a_lens_that_distorts_is_heeded(truth: list[np.ndarray]) -> None:
     assert rows.tolist() == [0]
     assert [int(axis[0]) for axis in pixels] == coords.long().tolist()
     assert find_pixels(cameras, 0, LENS, torch.from_numpy(point[None]).float())[1][1][0] > pixels[1][0]
+    behind = pose[:, 3] + pose[:, 2]
+    assert not len(find_pixels(cameras, 0, lens, torch.from_numpy(behind[None]).float())[0])
 
 
 def test_votes_are_the_share_of_the_other_views(truth: list[np.ndarray]) -> None:

@@ -177,6 +177,8 @@ def test_a_mask_over_the_whole_box_leaves_precrop_nothing() -> None:
 def test_alpha_edges_without_alpha_name_the_image() -> None:
     with pytest.raises(InputError, match=rf"image {NUMBERS[0]}: edge source 'alpha'"):
         following(edge_source="alpha").sample(batch_of())
+    with pytest.raises(InputError, match=rf"image {NUMBERS[0]}: edge source 'alpha'"):  # which begins at edges
+        following(early="uniform", late="soft-mining", edge_source="alpha").check_images(batch_of())
     assert len(following(edge_source="alpha").sample(batch_of(channels=4))["indices"]) == 64
 
 
@@ -259,6 +261,16 @@ def test_an_images_strength_is_computed_once(monkeypatch: pytest.MonkeyPatch) ->
     for subset in ([1, 2], [2, 3], [3, 1], [2]):
         sampler.sample(batch_of([(9, 14)] * len(subset), subset))
     assert len(computed) == len(set(computed)) == 3
+
+
+def test_as_many_strengths_as_pixels_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Half(Edge):
+        def strength(self, image: np.ndarray, background_color: Any) -> np.ndarray:
+            return super().strength(image, background_color)[::2]
+
+    monkeypatch.setitem(PIXEL_STRATEGIES, "edge", PixelStrategy(Half, ("early",), ""))
+    with pytest.raises(InputError, match=rf"image {NUMBERS[0]}: its strengths are \(5, 14\), .* \(9, 14\)"):
+        following().check_images(batch_of(SAME))
 
 
 # ---- nothing else changes

@@ -70,6 +70,19 @@ def test_segments_repeat_a_budget() -> None:
     assert [again.progress(step) for step in range(steps)] == [plan.progress(step) for step in range(steps)]
 
 
+def test_a_clock_that_went_back_is_not_a_speed() -> None:
+    """As of a run that an earlier version saved, which did not keep how long setting up took."""
+    plan = Plan(None, time_budget=20.0)
+    plan.decide(0, 8.0)
+    plan.decide(8, 9.0)
+    step, elapsed = sum(plan.segments), 2.0
+    plan.decide(step, elapsed)
+    while step != plan.num_steps:
+        step, elapsed = step + 1, elapsed + 0.1
+        plan.decide(step, elapsed)
+        assert elapsed < 21
+
+
 def test_a_resumed_plan_goes_on() -> None:
     plan = Plan(None, time_budget=20.0)
     plan.decide(0, 0.0)

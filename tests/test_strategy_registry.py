@@ -70,6 +70,15 @@ def test_names_that_are_taken_and_classes_that_cannot_be_imported(tmp_path: Path
     assert last.endswith("InputError: pixel strategy nowhere:Lost cannot be imported: No module named 'nowhere'")
 
 
+@pytest.mark.parametrize("target", ["dark_pixels : DarkPixels", "dark_pixels:Outer.DarkPixels"])
+def test_entry_points_are_what_pythons_standard_says(target: str, tmp_path: Path) -> None:
+    environment = install(tmp_path, f"dark = {target}")
+    with (tmp_path / "dark_pixels.py").open("a") as file:
+        file.write("\n\nclass Outer:\n    DarkPixels = DarkPixels\n")
+    run = subprocess.run([sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+
+
 def test_the_readme_tells_of_every_strategy_and_its_phases() -> None:
     rows = re.findall(r"^\| `([a-z-]+)` \| ([a-z, ]+) \|", README, flags=re.MULTILINE)
     assert dict(rows) == {name: ", ".join(strategy.phases) for name, strategy in PIXEL_STRATEGIES.items()}

@@ -91,7 +91,7 @@ ALL = Shard()
 def list_trials(experiment: Experiment, output_dir: Path, shard: Shard = ALL) -> None:
     """Print the trials of a shard that are known yet, and how many of them are pending."""
     result, _ = _load_with_shards(experiment, output_dir)
-    trials = shard.of(experiment.trials(result["runs"]))
+    trials = shard.of(_list_trials(experiment, result))
     for trial in trials:
         print(*asdict(trial).values(), sep=" | ")
     print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
@@ -100,26 +100,35 @@ def list_trials(experiment: Experiment, output_dir: Path, shard: Shard = ALL) ->
 def run_experiment(
     experiment: Experiment, output_dir: Path, new_executor: ExecutorFactory, shard: Shard = ALL
 ) -> dict[str, Any]:
-    """Train every pending trial of a shard; its result is written after each. InputError if the folder cannot be
-    written, or holds a result of other settings."""
+    """Train every pending trial of a shard; its result is written after each. InputError if there is no trial, or the
+    folder cannot be written, or holds a result of other settings."""
     path = shard.path(output_dir)
     result, is_new = _load_with_shards(experiment, output_dir)
-    trials = shard.of(experiment.trials(result["runs"]))
+    trials = shard.of(_list_trials(experiment, result))
     make_folder(path.parent, "--output-dir")
     result["errors"] = []
     if is_new:
         write_result(path, result)
     while pending(trials, result):
         _run_trials(experiment, trials, result, path, new_executor)
-        trials = shard.of(experiment.trials(result["runs"]))
+        trials = shard.of(_list_trials(experiment, result))
     for error in result["errors"]:
         print(*error.values(), sep=", ")
     return result
 
 
+def _list_trials(experiment: Experiment, result: dict[str, Any]) -> list[Any]:
+    """All trials that are known yet, each once; InputError if there are none."""
+    trials = list(dict.fromkeys(experiment.trials(result["runs"])))
+    if not trials:
+        raise InputError(f"bench {experiment.name}: there is no training of what the flags choose; choose more")
+    return trials
+
+
 def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[str, Any], bool]:
     """An experiment's result with the runs that only shards have, and whether there are any. InputError as
     `load_or_create`."""
+    _list_trials(experiment, {"runs": []})
     path = output_dir / "result.json"
     result = load_or_create(path, experiment.name, experiment.settings)
     _check_runs(experiment, result, path)
@@ -127,7 +136,7 @@ def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[st
     for path in sorted((output_dir / "shards").glob("*.json")):
         shard = load_or_create(path, experiment.name, experiment.settings)
         _check_runs(experiment, shard, path)
-        names = [field.name for field in fields(experiment.trials(result["runs"])[0])]
+        names = [field.name for field in fields(_list_trials(experiment, result)[0])]
         runs = {tuple(run[name] for name in names): run for run in [*shard["runs"], *result["runs"]]}
         result["runs"] = [runs[key] for key in sorted(runs)]
         result["command"] = "\n".join(dict.fromkeys([*shard["command"].splitlines(), *result["command"].splitlines()]))
@@ -137,8 +146,8 @@ def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[st
 def _check_runs(experiment: Experiment, result: dict[str, Any], path: Path) -> None:
     """InputError if a result has runs of no trial that the experiment could have, or errors that are none."""
     try:
-        trials = [asdict(trial) for trial in experiment.trials(result["runs"])]
-        names = list(trials[0]) if trials else []
+        trials = [asdict(trial) for trial in _list_trials(experiment, result)]
+        names = list(trials[0])
         sorted({tuple(run[name] for name in names) for run in [*trials, *result["runs"], *result["errors"]]})
     except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as problem:
         raise InputError(f"{path}: its runs are none of bench {experiment.name} ({quote(problem)})") from problem
@@ -218,7 +227,7 @@ def pending(trials: Sequence[Any], result: dict[str, Any]) -> list[Any]:
     """The trials that have neither a run nor an error in the result."""
     keys = list(asdict(trials[0])) if trials else []
     finished = {tuple(run.get(key) for key in keys) for run in [*result["runs"], *result["errors"]]}
-    return [trial for trial in dict.fromkeys(trials) if tuple(asdict(trial).values()) not in finished]
+    return [trial for trial in trials if tuple(asdict(trial).values()) not in finished]
 
 
 def _run_trials(

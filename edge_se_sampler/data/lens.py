@@ -117,7 +117,7 @@ def locate(
             shown_v = factor * v + k[2] * (square + 2 * v * v) + 2 * k[3] * u * v
         shown_x, shown_y = camera.fx * shown_u + camera.cx - 0.5, camera.fy * shown_v + camera.cy - 0.5
         inside = (shown_x >= -0.5) & (shown_x <= width - 0.5) & (shown_y >= -0.5) & (shown_y <= height - 0.5)
-        inside &= square <= _largest_radius(camera.lens, float(np.sqrt(square.max()))) ** 2
+        inside &= square <= _largest_radius(camera.lens, float(np.sqrt(square.max(initial=0.0)))) ** 2
         return np.stack((shown_x, shown_y)), inside
 
 

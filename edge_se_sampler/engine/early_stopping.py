@@ -26,6 +26,9 @@ class EarlyStopping:
         return {"best": self._best, "without_gain": self._without_gain}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from what `state_dict` returned; {}: from the beginning."""
+        """Continue from what `state_dict` returned; {}: from the beginning. Patience that was lost is there again: who
+        continues what has ended by it wants it to go on."""
         if state:
             self._best, self._without_gain = state["best"], state["without_gain"]
+            if self.is_due:
+                self._without_gain = 0

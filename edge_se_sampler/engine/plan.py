@@ -44,10 +44,10 @@ class Plan:
             return
         begin, since = self._measured_from
         self._measured_from = step, elapsed
-        if step == begin:
+        if step == begin or elapsed <= since:
             self.segments.append(FIRST_STEPS)
             return
-        seconds_per_step = max(elapsed - since, 1e-9) / (step - begin)
+        seconds_per_step = (elapsed - since) / (step - begin)
         seconds = max(0.0, self.time_budget - elapsed) / (NUM_SEGMENTS - len(self.segments))
         while sum(self.segments) == step and len(self.segments) < NUM_SEGMENTS:
             # of segments that are shorter than a step, only some have one

@@ -29,8 +29,8 @@ PARTS = {
     *("step", "elapsed", "config_digest", "model", "plan"),
     *("optimizer", "scheduler", "dead_network_reset", "sampler"),
 }
-ADDED_PARTS = {"early_stopping", "data_digest"}
-"""Which those of format 2 lack."""
+ADDED_PARTS = {"early_stopping", "data_digest", "setup_seconds"}
+"""Which those of earlier versions lack."""
 GROUP = {"params", "lr", "betas", "eps", "weight_decay", "amsgrad", "initial_lr", "maximum", "total_variation"}
 """What Adam's groups have in every version of torch, and ours."""
 
@@ -93,6 +93,7 @@ def check_parts(state: dict[str, Any], config: ModelConfig) -> None:
         and type(state["step"]) is int
         and 0 <= state["step"] < MAX_STEP
         and is_finite(state["elapsed"])
+        and is_finite(state.get("setup_seconds", 0.0))
     )
     if valid and isinstance(config, NeRFModelConfig):
         depth, width = config.preset.depth, config.preset.width

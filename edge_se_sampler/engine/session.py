@@ -41,7 +41,7 @@ from edge_se_sampler.sampling.settings import SamplingSettings
 def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
     A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
-    device = choose_device(config.machine.device_type)
+    device = choose_device(config.machine.device_type, of_run=run is not None)
     ranks.join(device)
     views = read_train_views(config)
     held_out = _read_first_split(config, ("val", "test"))
@@ -125,7 +125,12 @@ def _extend(config: TrainerConfig, state: dict[str, Any], num_iterations: int) -
     """The config of a run that is to have so many iterations in all; InputError if it cannot have them."""
     flag, done = "max-num-iterations", state["step"] + 1
     check_value(flag, num_iterations, num_iterations > done, f"above {done}, the iterations that are done")
-    check_value(flag, num_iterations, config.max_num_iterations is not None, "left out: this run's length is a time")
+    check_value(
+        flag,
+        num_iterations,
+        config.max_num_iterations is not None,
+        "left out: this run has --time-budget or --segments",
+    )
     check_value(flag, num_iterations, state["optimizer"] is not None, "left out: this run ended without its optimizer")
     return replace(config, new_num_iterations=num_iterations)
 
@@ -133,7 +138,7 @@ def _extend(config: TrainerConfig, state: dict[str, Any], num_iterations: int) -
 def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
     """A run's model with the weights of its last checkpoint, and that checkpoint; InputError if it is bad."""
     checkpoint, state = load_state(run, config)
-    model = build_model(config, choose_device(config.machine.device_type), saved_grid(state["model"]))
+    model = build_model(config, choose_device(config.machine.device_type, of_run=True), saved_grid(state["model"]))
     load_weights(model, state["model"])
     return model, checkpoint
 
@@ -145,6 +150,7 @@ def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayM
     for other, found in runs[1:]:
         for name, value, expected in (
             ("data", found.data, config.data),
+            ("data_format", found.data_format, config.data_format),
             ("eval_every", found.eval_every, config.eval_every),
             ("background_color", found.pipeline.model.background_color, config.pipeline.model.background_color),
         ):
@@ -193,7 +199,7 @@ def read_train_views(config: TrainerConfig) -> Views:
 
 def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> int:
     """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's own."""
-    if choose_device(config.machine.device_type) == "cuda":
+    if choose_device(config.machine.device_type, of_run=True) == "cuda":
         return 0
     return decide_size(config.pipeline.model, longest).training_memory(has_alpha)
 
@@ -255,12 +261,15 @@ def describe_run(trainer: Trainer) -> str:
     return "\n".join(lines)
 
 
-def choose_device(device_type: str) -> str:
-    """The torch device of --machine.device-type; InputError for a GPU that torch does not find."""
+def choose_device(device_type: str, of_run: bool = False) -> str:
+    """The torch device of --machine.device-type; for a GPU that torch does not find a run, which another machine may
+    have begun, is left to the CPU, and otherwise it is an InputError."""
     if device_type == "auto":  # mps only for who asks for it: nothing has been seen to train there
         return "cuda" if torch.cuda.is_available() else "cpu"
     backends = {"cuda": torch.cuda, "mps": torch.backends.mps}
     if device_type in backends and not backends[device_type].is_available():
+        if of_run:
+            return "cpu"
         raise InputError(f"--machine.device-type is {device_type}, but torch finds no GPU for it; use auto or cpu")
     return device_type
 

@@ -101,6 +101,8 @@ class Trainer:
         if is_same_data:
             load_sampler(self.pipeline.datamanager, state["sampler"])
         self.next_step, self.elapsed = state["step"] + 1, state["elapsed"]
+        # a time budget goes on from where it was; earlier versions did not keep them
+        self.setup_seconds = state.get("setup_seconds", self.setup_seconds)
         for group, initial in zip(self.optimizer.param_groups, self.scheduler.base_lrs, strict=True):
             group["lr"] = initial * self._learning_rate_factor(self.next_step)  # the plan may be another
             group["fused"] = self.optimizer.defaults["fused"]  # the torch or the device may be another
@@ -210,6 +212,7 @@ class Trainer:
         state = {
             "step": step,
             "elapsed": self.elapsed,
+            "setup_seconds": self.setup_seconds,
             "config_digest": config_digest(self.config),
             "model": self.pipeline.model.state_dict(),
             "plan": self.plan.state_dict(),

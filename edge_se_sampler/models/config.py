@@ -188,8 +188,8 @@ class LeanModelConfig(ModelConfig):
     cull_by_alpha: bool = True
     """Leave out what lies outside the visual hull of the alpha masks."""
     near_share: float | None = field(default=None, metadata=ADDED_LATER)
-    """Rays begin no nearer than at this share of the way to what the cameras look at. By default, in captures without
-    masks, as points or features tell, or 0.45; 0 with masks, and where near is given."""
+    """Rays begin no nearer than at this share of the way to what the cameras look at. By default as a reconstruction's
+    points tell; without those, where there are no masks, as features tell, or 0.45; 0 otherwise, and with a near."""
     step_size_voxels: float = 1.0
     """Distance between samples, as a multiple of a cell's size."""
     alpha_threshold: float = 0.02

@@ -25,9 +25,17 @@ class Ensemble(RayModel):
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`, for the networks that all members have."""
-        outputs = [member(rays) for member in self._models()]
+        outputs = [self._render_member(member, rays) for member in self._models()]
         common = set.intersection(*(set(rendered) for rendered in outputs))
         return {key: torch.stack([rendered[key] for rendered in outputs]).mean(dim=0) for key in sorted(common)}
+
+    def _render_member(self, member: RayModel, rays: RayBundle) -> dict[str, Tensor]:
+        """A member's outputs, the background of its depth moved to where this model's config has it."""
+        outputs = member(rays)
+        if "depth_fine" in outputs:
+            farther = (self.config.depths[1] - member.config.depths[1]) * rays.metadata["directions_norm"]
+            outputs["depth_fine"] = outputs["depth_fine"] + (1 - outputs["accumulation_fine"]) * farther
+        return outputs
 
     def _models(self) -> list[RayModel]:
         return [member for member in self.members if isinstance(member, RayModel)]  # what a type checker can tell

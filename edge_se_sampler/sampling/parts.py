@@ -82,7 +82,7 @@ class SamplerPart:
         """Learn from squared errors (n,) found at the drawn pixels of a step."""
 
     def state_dict(self) -> dict[str, Any]:
-        """What was learnt."""
+        """What was learnt, in what a checkpoint may hold: tensors, numbers, texts, None, lists and dicts of these."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -155,8 +155,12 @@ class Distribution(SamplerPart):
             raise InputError(f"image {int(batch.numbers[k])}: {problem}") from problem
 
     def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
-        """(H, W) strengths of the image at position k, 0 where it is masked; raises as `strength`."""
-        strength = torch.from_numpy(self.strength(batch.image(k), batch.background_color))
+        """(H, W) strengths of the image at position k, 0 where it is masked; raises as `strength`, and ValueError where
+        there are not as many as pixels."""
+        image = batch.image(k)
+        strength = torch.from_numpy(self.strength(image, batch.background_color))
+        if strength.shape != image.shape[:2]:
+            raise ValueError(f"its strengths are {tuple(strength.shape)}, and its pixels {image.shape[:2]}")
         return strength if batch.mask is None else strength * batch.valid(k)
 
     def drawable(self, batch: ImageBatch) -> tuple[PixelSource, Tensor, Tensor]:

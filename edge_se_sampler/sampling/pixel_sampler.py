@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.protocol import PixelSampler
 from edge_se_sampler.sampling.edges import WHITE
 from edge_se_sampler.sampling.image_batch import ImageBatch
@@ -88,10 +89,12 @@ class ImportantPixels:
         return self.config.early if self.schedule.phase(self._step.number) == "early" else self.config.late
 
     def check_images(self, image_batch: dict[str, Any]) -> None:
-        """Before training, refuse images that a phase could draw nothing from: InputError as `sample`."""
+        """Before training, refuse images that a phase could draw nothing from: InputError as `sample`. And strategies
+        whose state cannot be saved: InputError as `state_dict`."""
         batch = self._read(image_batch)
         for name in self.strategies:
             self.strategies[name].distribution.drawable(batch)
+        self.state_dict()
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
         """Choose the step's pixels; see the protocol's PixelSampler.sample.
@@ -134,8 +137,10 @@ class ImportantPixels:
         return self.is_bound and any(part.needs_errors for part in self.parts().values())
 
     def state_dict(self) -> dict[str, Any]:
-        """What later draws depend on besides the step, for a checkpoint."""
+        """What later draws depend on besides the step, for a checkpoint. InputError: that may not hold it."""
         states = {name: part.state_dict() for name, part in self.parts().items()}
+        for name, state in states.items():
+            _check_plain(name, state)
         return {name: state for name, state in states.items() if state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -178,6 +183,18 @@ class ImportantPixels:
         for part in self.parts().values():
             if part.needs_errors:
                 part.update(drawn, squared_error.detach(), self._step)
+
+
+def _check_plain(name: str, state: Any) -> None:
+    """InputError for a part's state that has more than `SamplerPart.state_dict` may return."""
+    if isinstance(state, (dict, list, tuple)):
+        for value in [*state, *state.values()] if isinstance(state, dict) else state:
+            _check_plain(name, value)
+    elif not (state is None or isinstance(state, Tensor) or type(state) in (bool, int, float, str)):
+        kind = f"{type(state).__module__}.{type(state).__qualname__}"
+        raise InputError(
+            f"{name}: its state_dict has a {kind}, which no checkpoint may hold; make it a tensor, or plain"
+        )
 
 
 class EdgeSEPixelSampler(ImportantPixels, PixelSampler):

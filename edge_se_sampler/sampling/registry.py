@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
 from edge_se_sampler.errors import InputError
@@ -40,9 +39,8 @@ class PixelStrategy:
         """The class. InputError: it cannot be imported."""
         if not isinstance(self.target, str):
             return self.target
-        module, _, name = self.target.partition(":")
         try:
-            return getattr(import_module(module), name)
+            return EntryPoint("", self.target, ENTRY_POINT_GROUP).load()
         except Exception as problem:  # whatever another package's import may raise
             raise InputError(f"pixel strategy {self.target} cannot be imported: {problem}") from problem
 

@@ -20,12 +20,14 @@ Sizes = Mapping[int, tuple[int, int]]
 
 
 def is_sampler_state(state: Mapping[str, Any], sampler: ImportantPixels, images: Sizes) -> bool:
-    """Whether a sampler of training images can continue from a state; parts of other packages judge their own."""
+    """Whether a sampler of training images can continue from a state; parts of other packages judge their own. Of an
+    early phase that was over there is none."""
     parts, package = sampler.parts(), __name__.partition(".")[0]
+    may_lack = f"{sampler.config.early}.distribution"
     return state.keys() <= parts.keys() and all(
         _is_part(state.get(name, {}), part.state_dict(), images)
         for name, part in parts.items()
-        if type(part).__module__.partition(".")[0] == package
+        if type(part).__module__.partition(".")[0] == package and (name in state or name != may_lack)
     )
 
 

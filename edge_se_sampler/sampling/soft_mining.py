@@ -30,7 +30,7 @@ from torch import Tensor
 from edge_se_sampler.sampling.cells import MIN_VALUE, CellTable, cell_means
 from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.learned import LearnedDistribution
-from edge_se_sampler.sampling.parts import PixelBatch, TrainingStep
+from edge_se_sampler.sampling.parts import PixelBatch, PixelSource, TrainingStep
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.settings import SamplingSettings
 from edge_se_sampler.sampling.strategies import Edge
@@ -62,6 +62,11 @@ class SoftMining(LearnedDistribution):
         if grown := len(cells.values) - len(self.map):
             self.map = np.append(self.map, np.zeros(grown))
         return cells, index
+
+    def drawable(self, batch: ImageBatch) -> tuple[PixelSource, Tensor, Tensor]:
+        """As `Distribution`; and InputError where there are no edges to begin from."""
+        self.edges.tables(batch)
+        return super().drawable(batch)
 
     def draw(self, batch: ImageBatch, count: int, step: TrainingStep) -> PixelBatch:
         """Move the walkers, and return the pixels that they stand on."""
