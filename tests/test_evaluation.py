@@ -204,7 +204,7 @@ def test_an_ensemble_renders_the_mean_of_its_members() -> None:
 
 def test_depths_of_an_ensemble_are_before_the_background_of_its_first_member() -> None:
     """What is behind a ray is removed from it, wherever each member has it."""
-    first, second = (with_constant_density(model_of(far=far), -1.0) for far in (6.0, 9.0))
+    first, second = (with_constant_density(model_of(far=far), 0.5) for far in (6.0, 9.0))
     rays = to_pictures(tiny_views(1, HEIGHT, WIDTH))[0].rays(first.device)
     each = [render_opaque(member, rays) for member in (first, second)]
     seen = [distance * opacity for _, distance, opacity in each]
