@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lean_models import full_model
 from tiny import tiny_config, tiny_views, with_constant_density
 from torch import Tensor
 
@@ -204,9 +205,11 @@ def test_an_ensemble_renders_the_mean_of_its_members() -> None:
 
 def test_depths_of_an_ensemble_are_before_the_background_of_its_first_member() -> None:
     """What is behind a ray is removed from it, wherever each member has it."""
-    first, second = (with_constant_density(model_of(far=far), 0.5) for far in (6.0, 9.0))
+    first, second = full_model(), full_model()
+    second.config = replace(second.config, far=9.0)
     rays = to_pictures(tiny_views(1, HEIGHT, WIDTH))[0].rays(first.device)
     each = [render_opaque(member, rays) for member in (first, second)]
     seen = [distance * opacity for _, distance, opacity in each]
+    assert 0.1 < float(each[1][2].max()) < 0.9
     _, distance, opacity = render_opaque(Ensemble([first, second]), rays)
     torch.testing.assert_close(distance * opacity, (seen[0] + seen[1]) / 2, rtol=1e-4, atol=1e-4)
