@@ -222,7 +222,7 @@ class TestRuns:
             (lambda c: c["pipeline"].update(model=3), "model"),
             (lambda c: c["machine"].update(seed="a"), "seed"),
             (lambda c: c.update(steps_per_log=1.5), "steps_per_log"),
-            (lambda c: c.update(data=None, checksum=None), "held-out"),
+            (lambda c: c.update(data=None, checksum=None), "data"),
             (lambda c: c.update(format=4), "format"),
         ],
     )

@@ -41,7 +41,7 @@ def state_of(run: Path) -> dict[str, Any]:
 def flat(value: Any) -> Any:
     """Nested values with tensors as bytes, so that == compares them."""
     if isinstance(value, dict):
-        return {key: flat(item) for key, item in value.items() if key != "elapsed"}
+        return {key: flat(item) for key, item in value.items() if key not in ("elapsed", "setup_seconds")}
     if isinstance(value, list | tuple):
         return [flat(item) for item in value]
     return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value

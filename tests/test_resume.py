@@ -95,7 +95,7 @@ def state(run: Path) -> dict[str, bytes | float | str]:
             flat[name] = value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
 
     flatten("", torch.load(io.BytesIO(content), weights_only=True))
-    del flat[".elapsed"]
+    del flat[".elapsed"], flat[".setup_seconds"]
     return flat
 
 
