@@ -91,7 +91,7 @@ ALL = Shard()
 def list_trials(experiment: Experiment, output_dir: Path, shard: Shard = ALL) -> None:
     """Print the trials of a shard that are known yet, and how many of them are pending."""
     result, _ = _load_with_shards(experiment, output_dir)
-    trials = shard.of(_list_trials(experiment, result))
+    trials = shard.of(_find_trials(experiment, result["runs"]))
     for trial in trials:
         print(*asdict(trial).values(), sep=" | ")
     print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
@@ -104,22 +104,22 @@ def run_experiment(
     folder cannot be written, or holds a result of other settings."""
     path = shard.path(output_dir)
     result, is_new = _load_with_shards(experiment, output_dir)
-    trials = shard.of(_list_trials(experiment, result))
+    trials = shard.of(_find_trials(experiment, result["runs"]))
     make_folder(path.parent, "--output-dir")
     result["errors"] = []
     if is_new:
         write_result(path, result)
     while pending(trials, result):
         _run_trials(experiment, trials, result, path, new_executor)
-        trials = shard.of(_list_trials(experiment, result))
+        trials = shard.of(_find_trials(experiment, result["runs"]))
     for error in result["errors"]:
         print(*error.values(), sep=", ")
     return result
 
 
-def _list_trials(experiment: Experiment, result: dict[str, Any]) -> list[Any]:
-    """All trials that are known yet, each once; InputError if there are none."""
-    trials = list(dict.fromkeys(experiment.trials(result["runs"])))
+def _find_trials(experiment: Experiment, runs: list[Run]) -> list[Any]:
+    """All trials that are known after some runs, each once; InputError if there are none."""
+    trials = list(dict.fromkeys(experiment.trials(runs)))
     if not trials:
         raise InputError(f"bench {experiment.name}: there is no training of what the flags choose; choose more")
     return trials
@@ -127,8 +127,8 @@ def _list_trials(experiment: Experiment, result: dict[str, Any]) -> list[Any]:
 
 def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[str, Any], bool]:
     """An experiment's result with the runs that only shards have, and whether there are any. InputError as
-    `load_or_create`."""
-    _list_trials(experiment, {"runs": []})
+    `load_or_create`, and where there is no trial."""
+    names = [field.name for field in fields(_find_trials(experiment, [])[0])]
     path = output_dir / "result.json"
     result = load_or_create(path, experiment.name, experiment.settings)
     _check_runs(experiment, result, path)
@@ -136,7 +136,6 @@ def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[st
     for path in sorted((output_dir / "shards").glob("*.json")):
         shard = load_or_create(path, experiment.name, experiment.settings)
         _check_runs(experiment, shard, path)
-        names = [field.name for field in fields(_list_trials(experiment, result)[0])]
         runs = {tuple(run[name] for name in names): run for run in [*shard["runs"], *result["runs"]]}
         result["runs"] = [runs[key] for key in sorted(runs)]
         result["command"] = "\n".join(dict.fromkeys([*shard["command"].splitlines(), *result["command"].splitlines()]))
@@ -146,7 +145,7 @@ def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[st
 def _check_runs(experiment: Experiment, result: dict[str, Any], path: Path) -> None:
     """InputError if a result has runs of no trial that the experiment could have, or errors that are none."""
     try:
-        trials = [asdict(trial) for trial in _list_trials(experiment, result)]
+        trials = [asdict(trial) for trial in experiment.trials(result["runs"])]
         names = list(trials[0])
         sorted({tuple(run[name] for name in names) for run in [*trials, *result["runs"], *result["errors"]]})
     except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as problem:
