@@ -296,8 +296,10 @@ def test_what_an_image_cuts_off_is_kept() -> None:
         seen |= ((low > 0) & (high < 100)).all(axis=0)
     assert 0.5 < seen.mean() < 1
     assert kept[seen].all()
+    assert not analyze_views(views, LeanModelConfig()).grid().is_carved_close
     inside = views_of(points * 0.3, focal=2.2)
     assert all(shape.uncropped for shape in find_silhouettes(inside).values())
+    assert analyze_views(inside, LeanModelConfig()).grid().is_carved_close
 
 
 # -- without alpha, and how much there is
@@ -344,8 +346,8 @@ def test_a_part_that_is_off_does_not_carve() -> None:
     assert whole.num_silhouettes == 0
     assert carved.hull.cells.sum() * carved.hull.cell_size**3 < 0.02 * whole.hull.cells.sum() * whole.hull.cell_size**3
     assert analyze_views(views, NeRFModelConfig(empty_space_skipping=True)).num_silhouettes == VIEWS
-    assert carved.grid().carved
-    assert not whole.grid().carved
+    assert carved.grid().is_carved_close
+    assert not whole.grid().is_carved_close
 
 
 def test_the_grid_knows_what_views_look_at_and_from_how_far() -> None:

@@ -50,14 +50,14 @@ def test_without_masks_it_begins_with_a_thin_fog_in_all_of_the_box() -> None:
     assert losses[-1] < losses[0]
 
 
-def test_the_fog_is_thin_in_whatever_part_of_a_box_that_no_masks_carved() -> None:
+def test_the_fog_is_thin_in_whatever_part_of_a_box_that_masks_leave() -> None:
     """A rig of cameras on one side sees half of it."""
     cells = torch.ones((8, 8, 8), dtype=torch.bool)
     cells[:4] = False
     thin = full_model(cells).density.detach()
     assert float(thin.max()) == pytest.approx(-math.log(8 * 2**2))  # optical depth 1 across
     grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, cells, 2)
-    grid.carved = True
+    grid.is_carved_close = True
     carved = LeanModel(LeanModelConfig(size="tiny"), np.random.default_rng(0), grid)
     assert float(carved.density.detach().min()) == INITIAL_RAW_DENSITY
 

@@ -106,9 +106,10 @@ class LeanModel(RayModel):
         super().__init__(config, grid)
         self.fine = ColorNetwork(rng)
         across = float(grid.size.max()) * 2 ** int(grid.max_level)
-        # where nothing was carved: optical depth 1 across, or more where samples of so little would be left out
+        # where cells are left before what is seen: optical depth 1 across, or more where samples of so little would be
+        # left out; more hides what is behind, and each view would learn a picture of its own on it
         thin = max(-math.log(across), self.marching.density_min + FOG_MARGIN)
-        raw = INITIAL_RAW_DENSITY if grid.carved else thin
+        raw = INITIAL_RAW_DENSITY if grid.is_carved_close else thin
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
         # only a checkpoint has cells that were subdivided, and it has their features, which would take seconds to draw
         shape = grid.num_rows, FEATURE_DIM

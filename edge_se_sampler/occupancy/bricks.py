@@ -47,8 +47,8 @@ class BrickGrid(nn.Module):
             nothing in it that they see; and how far away from it they are at most.
     """
 
-    carved: bool = False
-    """Whether cells were left out in which masks show nothing; not in the state."""
+    is_carved_close: bool = False
+    """Whether masks that show all of an object have left few cells around it; not in the state."""
 
     aabb_min: Tensor
     cell_size: Tensor

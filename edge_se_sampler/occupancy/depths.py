@@ -3,8 +3,8 @@
 focus  the point nearest to all optical axes
 depth  along a camera's optical axis, world units
 
-The best source there is decides: points that a reconstruction has seen, silhouettes, features that images share, or
-the cameras alone.
+The best source there is decides: points that a reconstruction has seen, silhouettes (with features that images share,
+where the object leaves most images), features, or the cameras alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.occupancy.hull import Box, Hull, carve, find_focus, find_silhouettes
+from edge_se_sampler.occupancy.hull import Box, Hull, carve, find_focus, find_silhouettes, show_whole_object
 from edge_se_sampler.occupancy.triangulation import find_points
 
 POINT_PERCENTILES = 0.5, 99.5
@@ -108,7 +108,8 @@ def _reach(views: Views) -> tuple[float, float, float] | None:
 
 
 def _depths_of_silhouettes(views: Views) -> DepthRange | None:
-    """The depths of the visual hull, as far as enough views see it."""
+    """The depths of the visual hull, as far as enough views see it; where few silhouettes show all of the object, no
+    nearer than features."""
     silhouettes = find_silhouettes(views)
     focus, depth = find_focus(views.cameras)
     distance = float(np.median(depth))
@@ -121,7 +122,20 @@ def _depths_of_silhouettes(views: Views) -> DepthRange | None:
     lowest, highest = _depths_of_hull(views.cameras, hull)
     reach = np.sqrt(3) / 2 * cell_size  # of a cell around its center
     near, far = _rounded(max(lowest - reach, CAMERA_FACTORS[0] * distance), highest + reach)
-    return DepthRange(near, far, "the silhouettes") if near < far else None
+    if not near < far:
+        return None
+    found = DepthRange(near, far, "the silhouettes")
+    return found if show_whole_object(silhouettes) else _begin_at_features(found, views)
+
+
+def _begin_at_features(found: DepthRange, views: Views) -> DepthRange:
+    """Depths of silhouettes that leave much before the object: no nearer than those of features, if there are enough
+    of them."""
+    features = _depths_of_features(views)
+    if features is None or not features.near < found.far:
+        return found
+    near, source = max(found.near, features.near), f"{found.source}, and {features.source}"
+    return DepthRange(near, found.far, source, features.near_share)
 
 
 def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[float, float]:

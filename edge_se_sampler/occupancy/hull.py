@@ -118,6 +118,11 @@ def find_silhouettes(views: Views) -> dict[int, Silhouette]:
     return found
 
 
+def show_whole_object(silhouettes: dict[int, Silhouette]) -> bool:
+    """Whether most silhouettes keep clear of their images' borders: others hardly tell how near the object comes."""
+    return 2 * sum(silhouette.uncropped for silhouette in silhouettes.values()) > len(silhouettes)
+
+
 def carve(
     views: Views, silhouettes: dict[int, Silhouette], box: Box, cell_size: float, max_cells: float = np.inf
 ) -> Hull | None:

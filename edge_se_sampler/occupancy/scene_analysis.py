@@ -23,6 +23,7 @@ from edge_se_sampler.occupancy.hull import (
     find_focus,
     find_hit_pixels,
     find_silhouettes,
+    show_whole_object,
 )
 
 MAX_INITIAL_CELLS = 2**18
@@ -40,6 +41,8 @@ class SceneAnalysis:
     box: Box
     num_silhouettes: int
     """Views whose alpha tells the object from the background; 0: nothing was carved."""
+    is_carved_close: bool
+    """Whether most of them show all of the object, so that the hull is little larger than it."""
     hull: Hull
     """The cells with which training begins: those that may hold something."""
     max_level: int
@@ -58,7 +61,7 @@ class SceneAnalysis:
         corner = torch.from_numpy(hull.aabb_min)
         focus = torch.from_numpy(self.focus)
         grid = BrickGrid.from_cells(corner, hull.cell_size, cells, self.max_level, self.num_pixels, focus)
-        grid.carved = self.num_silhouettes > 0
+        grid.is_carved_close = self.is_carved_close
         return grid
 
 
@@ -93,7 +96,9 @@ def analyze_scene(
     point, _ = find_focus(views.cameras)
     distances = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - point, axis=1)
     focus = np.array([*point, near_share, distances.max()])
-    return SceneAnalysis(box, len(silhouettes), hull, max_level, hit_pixels, num_pixels, focus)
+    return SceneAnalysis(
+        box, len(silhouettes), show_whole_object(silhouettes), hull, max_level, hit_pixels, num_pixels, focus
+    )
 
 
 def _carve_initial(
