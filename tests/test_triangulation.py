@@ -11,7 +11,7 @@ import torch
 
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.occupancy import depths, triangulation
+from edge_se_sampler.occupancy import triangulation
 from edge_se_sampler.occupancy.depths import find_depths
 from edge_se_sampler.occupancy.triangulation import find_points
 
@@ -94,30 +94,19 @@ def cut_out(views: Views, left: float) -> Views:
     return replace(views, images=tuple(images))
 
 
-def test_they_tell_what_cut_off_silhouettes_leave_open(plane: Views) -> None:
+def test_they_count_where_images_cut_the_object_off(plane: Views) -> None:
     """The plane goes on beyond the left edge of all images."""
     views = cut_out(plane, left=-9)
     found = find_depths(views)
-    assert found.source == "the silhouettes, and features that several images show"
-    assert 0.6 < found.near_share < 0.9
+    assert found.source == "features that several images show"
     assert found.near == pytest.approx(found.near_share * DISTANCE, rel=0.02)
-    flat = replace(views, images=tuple(np.where([1, 1, 1, 0], 200, image).astype(np.uint8) for image in views.images))
-    alone = find_depths(flat)
-    assert (alone.source, alone.near_share) == ("the silhouettes", 0)
-    assert alone.near < 2.5
-    assert found.far == alone.far
+    flat = tuple(np.where([1, 1, 1, 0], 200, image).astype(np.uint8) for image in views.images)
+    assert "cameras" in find_depths(replace(views, images=flat)).source
 
 
 def test_silhouettes_of_the_whole_object_need_none(plane: Views, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(triangulation, "_find_features", lambda *_: pytest.fail("features were looked for"))
     assert find_depths(cut_out(plane, left=-1)).source == "the silhouettes"
-
-
-def test_features_that_lie_behind_all_silhouettes_do_not_count(plane: Views, monkeypatch: pytest.MonkeyPatch) -> None:
-    features = depths.DepthRange(50.0, 60.0, "features that several images show", 0.9)
-    monkeypatch.setattr(depths, "_depths_of_features", lambda _: features)
-    found = find_depths(cut_out(plane, left=-9))
-    assert (found.source, found.near_share) == ("the silhouettes", 0)
 
 
 def test_what_is_unknown_has_no_features(plane: Views) -> None:

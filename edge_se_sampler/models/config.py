@@ -189,8 +189,8 @@ class LeanModelConfig(ModelConfig):
     """Leave out what lies outside the visual hull of the alpha masks."""
     near_share: float | None = field(default=None, metadata=ADDED_LATER)
     """Rays begin no nearer than at this share of the way to what the cameras look at. By default as a reconstruction's
-    points tell; without those, 0 where masks show all of an object, else as features tell; where there are neither
-    masks nor features, 0.45. 0 with a near."""
+    points tell; without those, 0 where masks show all of an object, else as features tell, or 0.45 without any. 0 with
+    a near."""
     step_size_voxels: float = 1.0
     """Distance between samples, as a multiple of a cell's size."""
     alpha_threshold: float = 0.02

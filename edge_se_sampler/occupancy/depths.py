@@ -3,8 +3,8 @@
 focus  the point nearest to all optical axes
 depth  along a camera's optical axis, world units
 
-The best source there is decides: points that a reconstruction has seen, silhouettes (with features that images share,
-where the object leaves most images), features, or the cameras alone.
+The best source there is decides: points that a reconstruction has seen, silhouettes that show all of an object,
+features that images share, or the cameras alone.
 """
 
 from __future__ import annotations
@@ -108,12 +108,12 @@ def _reach(views: Views) -> tuple[float, float, float] | None:
 
 
 def _depths_of_silhouettes(views: Views) -> DepthRange | None:
-    """The depths of the visual hull, as far as enough views see it; where few silhouettes show all of the object, no
-    nearer than features."""
+    """The depths of the visual hull, as far as enough views see it; None where the object leaves most images, which
+    see less than all of it."""
     silhouettes = find_silhouettes(views)
     focus, depth = find_focus(views.cameras)
     distance = float(np.median(depth))
-    if not silhouettes or distance <= 0:
+    if not show_whole_object(silhouettes) or distance <= 0:
         return None
     cell_size = 2 * distance / HULL_RESOLUTION
     hull = carve(views, silhouettes, Box(focus, distance, cell_size), cell_size)
@@ -122,20 +122,7 @@ def _depths_of_silhouettes(views: Views) -> DepthRange | None:
     lowest, highest = _depths_of_hull(views.cameras, hull)
     reach = np.sqrt(3) / 2 * cell_size  # of a cell around its center
     near, far = _rounded(max(lowest - reach, CAMERA_FACTORS[0] * distance), highest + reach)
-    if not near < far:
-        return None
-    found = DepthRange(near, far, "the silhouettes")
-    return found if show_whole_object(silhouettes) else _begin_at_features(found, views)
-
-
-def _begin_at_features(found: DepthRange, views: Views) -> DepthRange:
-    """Depths of silhouettes that leave much before the object: no nearer than those of features, if there are enough
-    of them."""
-    features = _depths_of_features(views)
-    if features is None or not features.near < found.far:
-        return found
-    near, source = max(found.near, features.near), f"{found.source}, and {features.source}"
-    return DepthRange(near, found.far, source, features.near_share)
+    return DepthRange(near, far, "the silhouettes") if near < far else None
 
 
 def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[float, float]:
