@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -215,6 +216,20 @@ def test_a_resumed_training_is_the_same_bit_for_bit_at_every_level(
     assert steps_of(second, 50 - stop, stop) == expected[stop:]
     for name, value in whole.pipeline.model.state_dict().items():
         assert torch.equal(second.pipeline.model.state_dict()[name], value), name
+
+
+@pytest.mark.parametrize(("rows", "levels"), [(9_000, [0, 0, 1]), (20_000, [1, 1, 2])])
+def test_a_level_that_memory_will_not_allow_is_left_out_and_the_one_before_begins_later(
+    rows: int, levels: list[int]
+) -> None:
+    """Halved cells have 8,000 rows, and four times as many are expected of the next; after 0.2025 and 0.45 of all."""
+    model = full_model()
+    model.config = replace(model.config, max_memory=rows * lean.BYTES_PER_ROW / 2**30)
+    for now, level in zip((0.21, 0.44, 0.46), levels, strict=True):
+        show_all(model)
+        model.update_cells(now - 0.01, now)
+        assert int(model.grid.level) == level
+    assert int(model.grid.max_level) == levels[-1]
 
 
 def test_cells_are_subdivided_though_a_host_still_holds_the_last_loss() -> None:

@@ -51,6 +51,8 @@ pixel of the training images that shows something: what is hardly seen is not le
 with more numbers than there are in the images the model remembers rather than learns."""
 MAX_RATIO = 0.8
 """Cells that would be larger than this part of the present ones are not worth subdividing."""
+ROWS_RATIO = 4
+"""How many times as many rows cells have once they are halved: surfaces are layers of them."""
 BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
 """Density, features, the running means of their gradients and those of squares, and what the grid keeps of a row."""
 
@@ -261,7 +263,7 @@ class LeanModel(RayModel):
 
     def _subdivide(self, remaining: float) -> bool:
         """Subdivide the cells that were seen, and those around them, as far as memory and what will be seen allow;
-        False: they do not at all.
+        False: they do not allow the finest level. Without it, this one ends later.
 
         Args:
             remaining: how much longer than until now the training goes on.
@@ -269,7 +271,7 @@ class LeanModel(RayModel):
         grid = self.grid
         finer = self._find_finer(self._find_seen(), remaining)
         if finer is None:
-            grid.level += 1
+            grid.max_level -= 1
             grid.reset_max_weight()
             return False
         ratio = float(finer.cell_size / grid.cell_size)
@@ -284,14 +286,18 @@ class LeanModel(RayModel):
 
     def _find_finer(self, kept: Tensor, remaining: float) -> BrickGrid | None:
         """Those of the grid's cells that are kept, halved; at last smaller, if enough will be seen for more rows;
-        larger, if memory is too little. None: it is too little even for cells that are worth subdividing."""
+        larger, if memory is too little. None: it is too little even for cells that are worth subdividing, now or, as
+        far as can be told, at the finest level."""
         grid, ratio = self.grid, 0.5
         assert self.config.max_memory is not None  # the config is resolved
+        most = self.config.max_memory * 2**30 / BYTES_PER_ROW
         finer = grid.subdivide(kept, float(grid.cell_size) / 2)
-        last = grid.level + 1 == grid.max_level
+        later = int(grid.max_level - grid.level) - 1
+        if later and ratio * (finer.num_rows * ROWS_RATIO**later / most) ** 0.4 > MAX_RATIO:
+            return None
         will_be_seen = remaining * int(grid.num_seen)
-        learnable = min(ROWS_PER_SEEN * will_be_seen, ROWS_PER_PIXEL * int(grid.num_pixels)) if last else 0
-        wanted = min(max(finer.num_rows, learnable), self.config.max_memory * 2**30 / BYTES_PER_ROW)
+        learnable = 0 if later else min(ROWS_PER_SEEN * will_be_seen, ROWS_PER_PIXEL * int(grid.num_pixels))
+        wanted = min(max(finer.num_rows, learnable), most)
         for _ in range(4):
             better = max(ratio * (finer.num_rows / wanted) ** 0.4, 0.25)  # surfaces are layers of some cells
             if better > MAX_RATIO:

@@ -63,11 +63,11 @@ class BrickGrid(nn.Module):
     num_seen: Tensor
     """() int64: how many weights that were."""
     finest_size: Tensor
-    """() float64: h at max_level, were cells always halved."""
+    """() float64: h at the max_level with which training begins, were cells always halved."""
     level: Tensor
-    """() int64: how often the cells have been subdivided, or were found to be small enough, 0 .. max_level."""
+    """() int64: how often the cells have been subdivided, 0 .. max_level."""
     max_level: Tensor
-    """() int64."""
+    """() int64: how often they are to be, less once there turn out to be too many."""
     num_pixels: Tensor
     """() int64."""
     focus: Tensor
