@@ -183,7 +183,7 @@ def test_a_grid_that_would_be_empty_is_an_error() -> None:
 def test_cells_are_subdivided_only_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second time they would be too many."""
     monkeypatch.setattr(lean, "ROWS_PER_SEEN", 100)
-    rows = 36 * 2**10 * lean.BYTES_PER_ROW / 2**30  # more than 8^3 cells and their corners take, less than 32^3
+    rows = 16 * 2**10 * lean.BYTES_PER_ROW / 2**30  # more than 8^3 cells and their corners take, less than 32^3
     trainer = tiny_trainer(config_of(60, max_memory=rows), VIEWS)
     model = trainer.pipeline.model
     begin = float(model.grid.cell_size)
@@ -218,7 +218,7 @@ def test_a_resumed_training_is_the_same_bit_for_bit_at_every_level(
         assert torch.equal(second.pipeline.model.state_dict()[name], value), name
 
 
-@pytest.mark.parametrize(("rows", "levels"), [(15_000, [0, 0, 1]), (30_000, [1, 1, 2])])
+@pytest.mark.parametrize(("rows", "levels"), [(9_000, [0, 0, 1]), (20_000, [1, 1, 2])])
 def test_a_level_that_memory_will_not_allow_is_left_out_and_the_one_before_begins_later(
     rows: int, levels: list[int]
 ) -> None:

@@ -49,9 +49,8 @@ ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.2, 1.5
 """Rows that there may be, once cells are smaller than was planned, for each weight that will be seen, and for each
 pixel of the training images that shows something: what is hardly seen is not learned any better in smaller cells, and
 with more numbers than there are in the images the model remembers rather than learns."""
-MAX_RATIO = 0.66
-"""Cells that would be larger than this part of the present ones, for there may be only half as many rows as halved ones
-have, are not worth subdividing: larger ones are as good if they are trained longer."""
+MAX_RATIO = 0.8
+"""Cells that would be larger than this part of the present ones are not worth subdividing."""
 ROWS_RATIO = 4
 """How many times as many rows cells have once they are halved: surfaces are layers of them."""
 BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
