@@ -49,7 +49,7 @@ ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.2, 1.5
 """Rows that there may be, once cells are smaller than was planned, for each weight that will be seen, and for each
 pixel of the training images that shows something: what is hardly seen is not learned any better in smaller cells, and
 with more numbers than there are in the images the model remembers rather than learns."""
-MAX_RATIO = 0.8
+MAX_RATIO = 0.85
 """Cells that would be larger than this part of the present ones are not worth subdividing."""
 ROWS_RATIO = 4
 """How many times as many rows cells have once they are halved: surfaces are layers of them."""
