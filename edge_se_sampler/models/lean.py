@@ -286,8 +286,8 @@ class LeanModel(RayModel):
 
     def _find_finer(self, kept: Tensor, remaining: float) -> BrickGrid | None:
         """Those of the grid's cells that are kept, halved; at last smaller, if enough will be seen for more rows;
-        larger, if memory is too little. None: it is too little even for cells that are worth subdividing, now or, as
-        far as can be told, at the finest level."""
+        larger, if memory is too little. None: it is too little even for cells that are worth subdividing, now or, by
+        an estimate of its rows, at the finest level."""
         grid, ratio = self.grid, 0.5
         assert self.config.max_memory is not None  # the config is resolved
         most = self.config.max_memory * 2**30 / BYTES_PER_ROW
