@@ -16,7 +16,7 @@ from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.models import voxel_backend
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.lean import INITIAL_RAW_DENSITY, LeanModel
+from edge_se_sampler.models.lean import INITIAL_DEPTH_CARVED, INITIAL_RAW_DENSITY, LeanModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
 
 
@@ -56,10 +56,17 @@ def test_the_fog_is_thin_in_whatever_part_of_a_box_that_masks_leave() -> None:
     cells[:4] = False
     thin = full_model(cells).density.detach()
     assert float(thin.max()) == pytest.approx(-math.log(8 * 2**2))  # optical depth 1 across
-    grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, cells, 2)
+
+
+@pytest.mark.parametrize(
+    ("max_level", "expected"), [(2, INITIAL_RAW_DENSITY), (7, math.log(INITIAL_DEPTH_CARVED / (8 * 2**7)))]
+)
+def test_the_fog_of_carved_cells_is_dense_but_for_very_small_ones(max_level: int, expected: float) -> None:
+    """So many small cells, each as dense, would hide what is behind them."""
+    grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, torch.ones((8, 8, 8), dtype=torch.bool), max_level)
     grid.is_carved_close = True
     carved = LeanModel(LeanModelConfig(size="tiny"), np.random.default_rng(0), grid)
-    assert float(carved.density.detach().min()) == INITIAL_RAW_DENSITY
+    torch.testing.assert_close(carved.density.detach(), torch.full((len(carved.density), 1), expected))
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.0, (2.0, 2.0, 2.0)), (0.5, (2.0, 2.5, 3.0))])

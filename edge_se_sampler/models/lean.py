@@ -31,7 +31,10 @@ from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttribute
 FEATURE_DIM, WIDTH = 16, 64
 """Features at a corner, and neurons of the hidden layer. The compiled kernels know no others."""
 INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
-"""Denser than the maximum is as opaque, and slow to become transparent again."""
+"""The most at first, and at all: denser than that is as opaque, and slow to become transparent again."""
+INITIAL_DEPTH, INITIAL_DEPTH_CARVED = 1.0, 8.5
+"""Optical depth that the box would have at first, if cells filled it; the latter where masks carve them close to the
+object: more hides what is behind, and each view would learn a picture of its own on it."""
 LAST_SUBDIVISION, LEVEL_RATIO = 0.45, 0.45
 """Part of the training after which the finest level begins, and by which each level ends before the next one does."""
 UNSETTLED = 0.4
@@ -42,7 +45,7 @@ more rays tell more of what is smaller than a pixel, but other pixels tell more 
 STEPS_PER_SAMPLED = 50
 """Steps after which cells that have become transparent are found again."""
 FOG_MARGIN = 0.3
-"""How much more raw density than what is seen training begins with, where all of a box may be occupied."""
+"""How much more raw density than what is sampled training begins with at least."""
 TRANSPARENT_MARGIN = 0.7
 """How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
 ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.2, 1.5
@@ -107,11 +110,10 @@ class LeanModel(RayModel):
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
         self.fine = ColorNetwork(rng)
-        across = float(grid.size.max()) * 2 ** int(grid.max_level)
-        # where cells are left before what is seen: optical depth 1 across, or more where samples of so little would be
-        # left out; more hides what is behind, and each view would learn a picture of its own on it
-        thin = max(-math.log(across), self.marching.density_min + FOG_MARGIN)
-        raw = INITIAL_RAW_DENSITY if grid.is_carved_close else thin
+        depth = INITIAL_DEPTH_CARVED if grid.is_carved_close else INITIAL_DEPTH
+        thin = math.log(depth / float(grid.size.max())) - int(grid.max_level) * math.log(2)
+        # samples of less would be left out
+        raw = min(max(thin, self.marching.density_min + FOG_MARGIN), INITIAL_RAW_DENSITY)
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
         # only a checkpoint has cells that were subdivided, and it has their features, which would take seconds to draw
         shape = grid.num_rows, FEATURE_DIM
