@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,6 +129,33 @@ def test_cells_are_not_subdivided_before_enough_was_seen() -> None:
     model.grid.update_max_weight(torch.arange(1), torch.ones(1))
     model.update_cells(0.3, 0.31)
     assert int(model.grid.level) == 1
+
+
+@pytest.mark.parametrize(("seen_per_row", "end"), [(lean.SEEN_PER_ROW + 1, 0.135), (lean.SEEN_PER_ROW - 1, 0.2025)])
+def test_levels_end_earlier_where_each_cell_will_be_seen_often(seen_per_row: float, end: float) -> None:
+    """For each of sixteen times as many rows, in what is left after 0.135 of the training."""
+    model = full_model()
+    show_all(model)
+    model.grid.num_seen.fill_(round(seen_per_row * 16 * model.grid.num_rows * 0.135 / 0.865))
+    levels = []
+    for before, now in itertools.pairwise((0.134, 0.1349, 0.1351, 0.2024, 0.2026)):
+        model.update_cells(before, now)
+        levels.append(int(model.grid.level))
+    assert levels == [0, *((0, 0, 1) if end > 0.2 else (1, 1, 1))]
+    show_all(model)
+    model.update_cells(end / 0.45 - 0.001, end / 0.45 + 0.001)
+    assert int(model.grid.level) == 2
+
+
+def test_whether_levels_end_earlier_is_kept_in_checkpoints_but_for_those_of_earlier_versions() -> None:
+    model, other = full_model(), full_model()
+    model.subdivides_early.fill_(True)
+    state = model.state_dict()
+    other.load_state_dict(state)
+    assert other.subdivides_early
+    del state["subdivides_early"]
+    other.load_state_dict(state)
+    assert not other.subdivides_early
 
 
 def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:

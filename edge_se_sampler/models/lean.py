@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,8 +36,11 @@ INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
 INITIAL_DEPTH, INITIAL_DEPTH_CARVED = 1.0, 8.5
 """Optical depth that the box would have at first, if cells filled it; the latter where masks carve them close to the
 object: more hides what is behind, and each view would learn a picture of its own on it."""
-LAST_SUBDIVISION, LEVEL_RATIO = 0.45, 0.45
-"""Part of the training after which the finest level begins, and by which each level ends before the next one does."""
+LAST_SUBDIVISION, EARLY_SUBDIVISION, LEVEL_RATIO = 0.45, 0.3, 0.45
+"""Part of the training after which the finest level begins; the same where each cell will be seen often; and by which
+each level ends before the next one does."""
+SEEN_PER_ROW = 22
+"""How many weights will then be seen for each row that the finest level is expected to have."""
 UNSETTLED = 0.4
 """Part of a level whose weights are not looked at when cells are pruned: they still move."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
@@ -106,6 +110,8 @@ class LeanModel(RayModel):
     grid: BrickGrid
     supersampled: Tensor
     """() bool: whether a pixel's color is the mean over 2 x 2 rays through it, rather than that of one."""
+    subdivides_early: Tensor
+    """() bool: whether levels begin by `EARLY_SUBDIVISION`."""
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
@@ -120,6 +126,12 @@ class LeanModel(RayModel):
         draws = np.zeros(shape, np.float32) if grid.level else rng.standard_normal(shape, np.float32) * np.float32(0.01)
         self.features = nn.Parameter(torch.from_numpy(draws))
         self.register_buffer("supersampled", torch.tensor(False))
+        self.register_buffer("subdivides_early", torch.tensor(False))
+
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        state, prefix = arguments[:2]
+        state.setdefault(f"{prefix}subdivides_early", torch.tensor(False))  # earlier versions had none
+        super()._load_from_state_dict(*arguments, **options)
 
     @property
     def marching(self) -> Marching:
@@ -234,6 +246,8 @@ class LeanModel(RayModel):
         """Do what is due as training goes on from one part of it to the next, both in [0, 1]; tells whether cells were
         subdivided. FloatingPointError: they hold nothing."""
         grid = self.grid
+        if not grid.level and before < self._level_end(EARLY_SUBDIVISION, 0) <= now:
+            self.subdivides_early.fill_(self._will_be_seen_often((1 - now) / now))
         begin, end = self._level_span()
         if before < begin + UNSETTLED * (end - begin) <= now:
             grid.reset_max_weight()
@@ -252,9 +266,18 @@ class LeanModel(RayModel):
 
     def _level_span(self) -> tuple[float, float]:
         """Parts of the training at which the grid's level begins and ends."""
-        remaining = int(self.grid.max_level - self.grid.level)
-        begin, end = (LAST_SUBDIVISION * LEVEL_RATIO ** (levels - 1) for levels in (remaining + 1, remaining))
-        return begin if self.grid.level else 0.0, end if remaining else 1.0
+        last, level = EARLY_SUBDIVISION if self.subdivides_early else LAST_SUBDIVISION, int(self.grid.level)
+        begin = self._level_end(last, level - 1) if level else 0.0
+        return begin, self._level_end(last, level) if level < self.grid.max_level else 1.0
+
+    def _level_end(self, last: float, level: int) -> float:
+        """Part of the training after which a level ends, all before the finest one, which begins after `last`."""
+        return last * LEVEL_RATIO ** (int(self.grid.max_level) - level - 1)
+
+    def _will_be_seen_often(self, remaining: float) -> bool:
+        """Whether training is long for so many cells; it goes on for that much longer than until now."""
+        expected_rows = self.grid.num_rows * ROWS_RATIO ** int(self.grid.max_level)
+        return remaining * int(self.grid.num_seen) >= SEEN_PER_ROW * expected_rows
 
     def _find_seen(self) -> Tensor:
         """(X, Y, Z) bool: cells that had a weight in some color. FloatingPointError: there are none."""
