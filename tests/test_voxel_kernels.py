@@ -226,14 +226,14 @@ def test_finer_corners_have_the_values_around_them(ops: ModuleType, ratio: float
 
 COMPILED = """
 from numba.core.registry import CPUDispatcher
-from edge_se_sampler.models import lean
+from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.voxel_kernels import marching, rendering, rows, shading
 
 def signatures():
     functions = [f for m in (marching, rendering, rows, shading) for f in vars(m).values()]
     return {f.py_func.__name__: len(f.signatures) for f in functions if isinstance(f, CPUDispatcher)}
 
-lean.compile_ops("cpu")
+compile_ops("cpu")
 compiled = signatures()
 from lean_models import config_of, steps_of, VIEWS
 from tiny import tiny_trainer

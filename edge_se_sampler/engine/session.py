@@ -30,9 +30,9 @@ from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.engine.saved_state import check_parts
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.config import LeanModelConfig, NeRFModelConfig, apply_preset, decide_size
 from edge_se_sampler.models.ensemble import Ensemble
-from edge_se_sampler.models.lean import compile_ops
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.settings import SamplingSettings

@@ -12,8 +12,6 @@ raw    logarithm of the optical depth across h: it can never make the density 0,
 from __future__ import annotations
 
 import math
-import sys
-import time
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,7 @@ from torch import Tensor, nn
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
-from edge_se_sampler.models.voxel_backend import choose_ops, compiled_ops
+from edge_se_sampler.models.voxel_backend import choose_ops
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.saved_grid import MAX_SIZE
@@ -62,28 +60,6 @@ ROWS_RATIO = 4
 """How many times as many rows cells have once they are halved: surfaces are layers of them."""
 BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
 """Density, features, the running means of their gradients and those of squares, and what the grid keeps of a row."""
-
-
-def compile_ops(device: str) -> None:
-    """Compile the kernels for models on a device, if there are any, and say how long it took if it took long: numba
-    keeps them for the next time."""
-    ops, began = device == "cpu" and compiled_ops(), time.monotonic()
-    if not ops:
-        return
-    cells = torch.ones((1, 1, 1), dtype=torch.bool)
-    grid = BrickGrid.from_cells(torch.zeros(3), 1.0, cells, max_level=1)
-    model = LeanModel(LeanModelConfig(size="tiny", near=0.0), np.random.default_rng(0), grid)
-    norm = {"directions_norm": torch.ones(1, 1)}
-    ray = RayBundle(torch.full((1, 3), 0.1), torch.full((1, 3), 3**-0.5), torch.zeros((1, 1), dtype=torch.int64), norm)
-    loss, _ = model.training_loss(ray, {"image": torch.rand(1, 4)})
-    loss.sum().backward()
-    for weight in (model.density, model.features):
-        rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
-        ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
-        ops.find_dense_cells(grid, weight.data, 0.0)
-        ops.resample(grid.subdivide(cells, 0.5).bricks, 0.5, grid.numbers, weight.data)
-    if time.monotonic() - began > 5:
-        print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)
 
 
 class ColorNetwork(nn.Module):

@@ -23,8 +23,9 @@ from edge_se_sampler.engine.config import OptimizerConfig
 from edge_se_sampler.engine.optimizers import RowAdam, build_adam, learning_rate_factor, torch_groups
 from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths, saved_grid
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
-from edge_se_sampler.models.lean import LeanModel, compile_ops
+from edge_se_sampler.models.lean import LeanModel
 from edge_se_sampler.nerfstudio.resume import run_progress
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.image_batch import unit_interval

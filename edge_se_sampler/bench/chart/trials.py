@@ -31,8 +31,8 @@ from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.rendering import Picture, render_rays, to_pictures
 from edge_se_sampler.engine.session import prepare, read_test_views
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.config import LeanModelConfig
-from edge_se_sampler.models.lean import compile_ops
 from edge_se_sampler.models.ray_model import RayModel
 
 EVAL_SECONDS = (1, 2, 3, 5, 7, 10, 14, 20, 30, 45, 60, 80, 100)

@@ -41,7 +41,7 @@ from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import disable_malloc_trimming, resolve_config
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models.lean import compile_ops
+from edge_se_sampler.models.compilation import compile_ops
 
 
 def run_trial(trial: Trial, settings: Settings, data: Path) -> Run:
