@@ -87,7 +87,7 @@ class LeanModel(RayModel):
     supersampled: Tensor
     """() bool: whether a pixel's color is the mean over 2 x 2 rays through it, rather than that of one."""
     subdivides_early: Tensor
-    """() bool: whether levels begin by `EARLY_SUBDIVISION`."""
+    """() bool: whether the finest level begins at EARLY_SUBDIVISION, and those before it accordingly."""
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
@@ -251,7 +251,8 @@ class LeanModel(RayModel):
         return last * LEVEL_RATIO ** (int(self.grid.max_level) - level - 1)
 
     def _will_be_seen_often(self, remaining: float) -> bool:
-        """Whether training is long for so many cells; it goes on for that much longer than until now."""
+        """Whether weights will be seen often enough for the finest level to begin early, judged by those of this level,
+        the first; remaining: as `_subdivide`."""
         expected_rows = self.grid.num_rows * ROWS_RATIO ** int(self.grid.max_level)
         return remaining * int(self.grid.num_seen) >= SEEN_PER_ROW * expected_rows
 
