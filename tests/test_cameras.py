@@ -93,11 +93,9 @@ def test_a_pixels_quarters_are_where_opencv_sees_them() -> None:
     cameras = some_cameras()
     for camera, (rows, columns) in enumerate(SIZES):
         rays = cameras.image_rays(camera)
-        split = rays.split_pixels()
-        assert len(split) == 4 * len(rays)
-        assert torch.equal(split.camera_indices, rays.camera_indices.repeat_interleave(4, dim=0))
-        np.testing.assert_allclose(split.directions.norm(dim=1), 1, rtol=1e-12)
-        points = split.origins + 3 * split.metadata["directions_norm"] * split.directions
+        directions, norm = rays.split_pixels()
+        np.testing.assert_allclose(directions.norm(dim=2), 1, rtol=1e-12)
+        points = (rays.origins[:, None] + 3 * norm * directions).reshape(-1, 3)
         seen = project(cameras, camera, points.numpy())
         corner = np.stack(np.divmod(np.arange(rows * columns), columns), axis=1)
         np.testing.assert_allclose(seen[:, :2], (corner[:, None] + quarters).reshape(-1, 2), atol=1e-9)
@@ -160,6 +158,17 @@ def test_a_slice_of_rays_is_those_rays() -> None:
     for one, other in ((part.origins, alone.origins), (part.directions, alone.directions)):
         torch.testing.assert_close(one, other)
     torch.testing.assert_close(part.metadata["directions_norm"], alone.metadata["directions_norm"])
+
+
+@pytest.mark.parametrize("pixels", [slice(None), slice(3, 11), slice(5, 5)])
+def test_an_images_rays_are_those_of_its_pixels(pixels: slice) -> None:
+    for camera, (rows, columns) in enumerate(SIZES):
+        indices = torch.cartesian_prod(torch.tensor([camera]), torch.arange(rows), torch.arange(columns))[pixels]
+        found, expected = some_cameras().image_rays(camera, pixels), some_cameras().pixel_rays(indices)
+        assert len(found) == len(indices)
+        for name, value in {**vars(expected), **expected.metadata}.items():
+            if name != "metadata":
+                torch.testing.assert_close({**vars(found), **found.metadata}[name], value)
 
 
 @pytest.fixture(scope="module")

@@ -77,13 +77,13 @@ def test_every_output_of_a_wall() -> None:
 
 def test_a_frame_is_rendered_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """All rays of a frame of 8192 x 8192 pixels would take many gigabytes."""
-    whole, pixels = render_frame(WALL, CAMERAS, 1, OUTPUTS, 0.001), []
+    whole, drawn = render_frame(WALL, CAMERAS, 1, OUTPUTS, 0.001), []
     monkeypatch.setattr(WALL, "chunks", lambda count: (slice(i, i + 10) for i in range(0, count, 10)))
-    pixel_rays = Cameras.pixel_rays
-    monkeypatch.setattr(Cameras, "pixel_rays", lambda self, some: pixels.append(some) or pixel_rays(self, some))
+    generate = Cameras.generate_rays
+    monkeypatch.setattr(Cameras, "generate_rays", lambda *args: drawn.append(args[2]) or generate(*args))
     parts = render_frame(WALL, CAMERAS, 1, OUTPUTS, 0.001)
-    assert [len(some) for some in pixels] == [10, 10]
-    assert torch.equal(torch.cat(pixels), torch.cartesian_prod(torch.tensor([0]), torch.arange(4), torch.arange(5)))
+    assert [len(coords) for coords in drawn] == [10, 10]
+    assert torch.equal(torch.cat(drawn), torch.cartesian_prod(torch.arange(4), torch.arange(5)) + 0.5)
     for name in OUTPUTS:
         np.testing.assert_array_equal(parts[name], whole[name])
 

@@ -77,7 +77,8 @@ def test_rays_begin_at_a_share_of_the_way_to_the_focus(share: float, expected: t
     origins = torch.tensor([[9.0, 9.0, 12.0], [9.0, 4.0, 9.0], [9.0 + 12.0, 9.0, 9.0]])
     directions = torch.nn.functional.normalize(9 - origins, dim=1)
     norm = {"directions_norm": torch.ones(3, 1)}
-    spans = model._spans(RayBundle(origins, directions, torch.zeros((3, 1), dtype=torch.int64), norm))
+    rays = RayBundle(origins, directions, torch.zeros((3, 1), dtype=torch.int64), norm)
+    spans = model._spans(rays, 1)
     begin = spans.begin * float(model.grid.cell_size)
     torch.testing.assert_close(begin, torch.tensor(expected))
 
@@ -100,7 +101,10 @@ def test_a_supersampled_pixel_is_the_mean_of_its_quarters() -> None:
         model.density.copy_(torch.from_numpy(np.random.default_rng(1).normal(size=model.density.shape)))
         model.features.mul_(100)
     rays = tiny_rays(50, dtype=torch.float32)
-    center, quarters = model(rays), model(rays.split_pixels())
+    directions, norm = rays.split_pixels()
+    origins, camera_indices = (x.repeat_interleave(4, dim=0) for x in (rays.origins, rays.camera_indices))
+    split = RayBundle(origins, directions.reshape(-1, 3), camera_indices, {"directions_norm": norm.reshape(-1, 1)})
+    center, quarters = model(rays), model(split)
     model.supersampled.fill_(True)
     pixels = model(rays)
     for key in ("rgb_fine", "accumulation_fine"):

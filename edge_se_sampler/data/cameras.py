@@ -31,17 +31,14 @@ class RayBundle:
         metadata = {key: value[rows] for key, value in self.metadata.items()}
         return RayBundle(self.origins[rows], self.directions[rows], self.camera_indices[rows], metadata)
 
-    def split_pixels(self) -> RayBundle:
-        """4 n rays: each ray replaced by those through the centers of its pixel's quarters."""
+    def split_pixels(self) -> tuple[Tensor, Tensor]:
+        """Unit vectors (n, 4, 3) through the centers of each pixel's quarters, and their directions_norm (n, 4, 1)."""
         center = self.directions * self.metadata["directions_norm"]
         down, right = (self.metadata["pixel_axes"] / 4).unbind(dim=1)
-        quarters = center - down - right, center - down + right, center + down - right, center + down + right
-        directions = torch.stack(quarters, dim=1).reshape(-1, 3)
-        norm = directions.norm(dim=1, keepdim=True)
-        origins, camera_indices = (x.repeat_interleave(4, dim=0) for x in (self.origins, self.camera_indices))
-        kept = {"nears", "fars"} & self.metadata.keys()
-        bounds = {key: self.metadata[key].repeat_interleave(4, dim=0) for key in kept}
-        return RayBundle(origins, directions / norm, camera_indices, {"directions_norm": norm, **bounds})
+        falling, rising = down + right, down - right  # diagonals
+        quarters = torch.stack((center - falling, center - rising, center + rising, center + falling), dim=1)
+        norm = quarters.norm(dim=2, keepdim=True)
+        return quarters / norm, norm
 
 
 @dataclass(frozen=True)
@@ -96,17 +93,15 @@ class Cameras:
         return replace(self, **intrinsics, width=self.width // factor, height=self.height // factor)
 
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
-        """A ray through each of coords (n, 2), float y, x in pixels, of the cameras (n, 1) int64."""
-        c = camera_indices[:, 0]
-        x = (coords[:, 1:] - self.cx[c]) / self.fx[c]
-        y = -(coords[:, :1] - self.cy[c]) / self.fy[c]
-        in_camera = torch.cat((x, y, -torch.ones_like(x)), dim=1)
-        pose = self.camera_to_worlds[c]
-        directions = (pose[:, :, :3] @ in_camera[:, :, None])[:, :, 0]
+        """A ray through each of coords (n, 2), float y, x in pixels, of the cameras (n, 1) int64, or of one (1, 1)."""
+        c, n = camera_indices[:, 0], len(coords)
+        right, up, back, origins = self.camera_to_worlds[c].unbind(dim=2)
+        x, y = (coords[:, 1:] - self.cx[c]) / self.fx[c], (self.cy[c] - coords[:, :1]) / self.fy[c]
+        directions = x * right + y * up - back
         norm = directions.norm(dim=1, keepdim=True)
-        pixel_axes = torch.stack((-pose[:, :, 1] / self.fy[c], pose[:, :, 0] / self.fx[c]), dim=1)
+        pixel_axes = torch.stack((-up / self.fy[c], right / self.fx[c]), dim=1).expand(n, 2, 3)
         metadata = {"directions_norm": norm, "pixel_axes": pixel_axes}
-        return RayBundle(pose[:, :, 3], directions / norm, camera_indices, metadata)
+        return RayBundle(origins.expand(n, 3), directions / norm, camera_indices.expand(n, 1), metadata)
 
     def pixel_rays(self, pixels: Tensor) -> RayBundle:
         """Rays through the centers of pixels: (n, 3) int64 camera, row, column -> n rays."""
@@ -116,8 +111,9 @@ class Cameras:
     def image_rays(self, camera: int, pixels: slice = slice(None)) -> RayBundle:
         """Rays of one camera, row by row: of all its pixels, or of some, numbered in that order."""
         height, width = int(self.height[camera]), int(self.width[camera])
-        pixel = torch.arange(*pixels.indices(height * width))
-        return self.pixel_rays(torch.stack((torch.full_like(pixel, camera), pixel // width, pixel % width), dim=1))
+        pixel = torch.arange(*pixels.indices(height * width), device=self.fx.device)
+        coords = torch.stack((pixel // width, pixel % width), dim=1) + 0.5
+        return self.generate_rays(torch.tensor([[camera]], device=pixel.device), coords)
 
     def project(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
         """Where one camera sees points (m, 3) in world units: the inverse of `generate_rays`. Returns coords (m, 2),

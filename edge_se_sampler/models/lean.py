@@ -155,12 +155,13 @@ class LeanModel(RayModel):
 
     def render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
         """Outputs of `forward`, and what they were made of."""
-        split, size = (rays.split_pixels(), 4) if self.supersampled else (rays, 1)
-        spans, jitter = self._spans(split), self.uniform(len(rays), size).reshape(-1) if self.training else None
+        size = 4 if self.supersampled else 1
+        spans, jitter = self._spans(rays, size), self.uniform(len(rays), size).reshape(-1) if self.training else None
         weights = self.density, self.features, self.fine.weights()
         rendered = choose_ops(self.density).render(self.grid, *weights, spans, jitter, self.marching)
         of_rays = rendered.rgb, rendered.accumulation, rendered.distance
-        rgb, accumulation, distance = (x.reshape(len(rays), size, x.shape[1]).mean(dim=1) for x in of_rays)
+        # the sum of columns, for torch's means over few numbers are slow
+        rgb, accumulation, distance = (sum(x.reshape(-1, size, x.shape[1]).unbind(dim=1)) / size for x in of_rays)
         background, passing = self.get_background(rays), 1 - accumulation
         outputs = {"rgb_fine": rgb + passing * background, "accumulation_fine": accumulation}
         if not self.training:
@@ -168,29 +169,25 @@ class LeanModel(RayModel):
             outputs["depth_fine"] = depth + passing * self.config.depths[1] * rays.metadata["directions_norm"]
         return outputs | {"background": background}, rendered
 
-    def _spans(self, rays: RayBundle) -> RaySpans:
-        """Rays in units of cells, from where they enter the box, or the near depth or what is empty ends, to where they
-        leave it."""
+    def _spans(self, rays: RayBundle, size: int) -> RaySpans:
+        """Rays in units of cells, 1 or 4 through each pixel, from where they enter the box, or the near depth or what
+        is empty ends, to where they leave it."""
         cell_size = float(self.grid.cell_size)
-        origins = self.grid.to_cell_units(rays.origins).to(self.dtype)
-        inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
-        one, other = -origins * inverse, (self.grid.size - origins) * inverse
-        norm = rays.metadata["directions_norm"][:, 0] / cell_size
+        whole = rays.directions, rays.metadata["directions_norm"]
+        directions, norm = (x.reshape(-1, x.shape[-1]) for x in (rays.split_pixels() if size > 1 else whole))
+        of_pixels = self.grid.to_cell_units(rays.origins).to(self.dtype)
         if "nears" in rays.metadata:
-            near, far = (rays.metadata[name][:, 0] / cell_size for name in ("nears", "fars"))
+            near, far = (rays.metadata[name] / cell_size for name in ("nears", "fars"))
         else:
-            near, far = (depth * norm for depth in self.config.depths)
-            near = torch.maximum(near, self.grid.empty_depth(rays.origins) * norm)
-        begin = torch.minimum(one, other).amax(dim=1).clamp(min=0)
-        end = torch.maximum(one, other).amin(dim=1)
+            (nearest, farthest), scale = self.config.depths, norm.reshape(-1, size) / cell_size
+            near, far = self.grid.empty_depth(rays.origins).clamp(min=nearest)[:, None] * scale, farthest * scale
         # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid
-        end = torch.where((origins.abs() < MAX_SIZE).all(dim=1), end, 0)
-        return RaySpans(
-            origins,
-            rays.directions,
-            torch.maximum(begin, near),
-            torch.minimum(end, far),
-        )
+        far = torch.where((of_pixels.abs() < MAX_SIZE).all(dim=1, keepdim=True), far, 0)
+        origins, inverse = of_pixels.repeat_interleave(size, dim=0), 1 / torch.where(directions == 0, 1e-12, directions)
+        one, other = -origins * inverse, (self.grid.size - origins) * inverse
+        begin = torch.minimum(one, other).amax(dim=1).clamp(min=0).reshape(-1, size).maximum(near)
+        end = torch.maximum(one, other).amin(dim=1).reshape(-1, size).minimum(far)
+        return RaySpans(origins, directions, begin.reshape(-1), end.reshape(-1))
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Prunes and subdivides cells, by the part of the training that is done; now and then finds those that have
