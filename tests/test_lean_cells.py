@@ -167,9 +167,9 @@ def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
     assert not model.grid.max_weight.any()
 
 
-@pytest.mark.parametrize(("times", "expected"), [(1024, 4), (1023, 512)])
+@pytest.mark.parametrize(("times", "expected"), [(3840, 4), (3839, 512)])
 def test_finest_cells_in_which_nothing_was_seen_are_left_out_if_enough_was(times: int, expected: int) -> None:
-    """Between 0.4 and 0.7 of the level, here the only one; enough are eight weights for each of 512 cells."""
+    """Between 0.4 and 0.7 of the level, here the only one; enough are thirty weights for each of 512 cells."""
     model = full_model(max_level=0)
     rendered = model.render(tiny_rays(50, dtype=torch.float32))[1]
     remembering = []

@@ -42,7 +42,7 @@ SEEN_PER_ROW = 22
 UNSETTLED, LAST_PRUNING = 0.4, 0.7
 """Part of a level whose weights are not looked at when cells are pruned: they still move; part of the finest level
 after which cells are left out in which nothing was seen in between."""
-SEEN_PER_CELL = 8
+SEEN_PER_CELL = 30
 """How many weights must have been seen for each cell by then: else nobody knows in which there is nothing to see."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
 """Part of the training after which a pixel has 2 x 2 rays, and how often all of them must have been trained on before:
