@@ -167,33 +167,6 @@ def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
     assert not model.grid.max_weight.any()
 
 
-@pytest.mark.parametrize(("times", "expected"), [(3840, 4), (3839, 512)])
-def test_finest_cells_in_which_nothing_was_seen_are_left_out_if_enough_was(times: int, expected: int) -> None:
-    """Between 0.4 and 0.7 of the level, here the only one; enough are thirty weights for each of 512 cells."""
-    model = full_model(max_level=0)
-    rendered = model.render(tiny_rays(50, dtype=torch.float32))[1]
-    remembering = []
-
-    def go_on(before: float, now: float) -> None:
-        model.update_cells(before, now)
-        seen = int(model.grid.num_seen)
-        model.remember(rendered)
-        remembering.append(int(model.grid.num_seen) > seen)
-
-    show_all(model)
-    go_on(0.38, 0.39)
-    go_on(0.39, 0.41)
-    model.grid.reset_max_weight()
-    cells = torch.nonzero(model.grid.occupied.reshape(-1))[::150, 0]
-    model.grid.update_max_weight(cells.repeat(times), torch.full((4 * times,), 0.01))
-    assert model.grid.occupied.sum() == 512
-    go_on(0.69, 0.71)
-    assert model.grid.occupied.sum() == expected
-    assert model.grid.occupied.reshape(-1)[cells].all()
-    assert (unpack_bits(model.grid.sampled) == model.grid.occupied).all()
-    assert remembering == [False, True, False]
-
-
 def test_cells_that_have_become_transparent_are_not_sampled() -> None:
     model = full_model()
     with torch.no_grad():

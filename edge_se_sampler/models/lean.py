@@ -39,11 +39,8 @@ LAST_SUBDIVISION, EARLY_SUBDIVISION, LEVEL_RATIO = 0.45, 0.3, 0.45
 each level ends before the next one does."""
 SEEN_PER_ROW = 22
 """How many weights will then be seen for each row that the finest level is expected to have."""
-UNSETTLED, LAST_PRUNING = 0.4, 0.7
-"""Part of a level whose weights are not looked at when cells are pruned: they still move; part of the finest level
-after which cells are left out in which nothing was seen in between."""
-SEEN_PER_CELL = 30
-"""How many weights must have been seen for each cell by then: else nobody knows in which there is nothing to see."""
+UNSETTLED = 0.4
+"""Part of a level whose weights are not looked at when cells are pruned: they still move."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
 """Part of the training after which a pixel has 2 x 2 rays, and how often all of them must have been trained on before:
 more rays tell more of what is smaller than a pixel, but other pixels tell more of what is not yet known."""
@@ -91,8 +88,6 @@ class LeanModel(RayModel):
     """() bool: whether a pixel's color is the mean over 2 x 2 rays through it, rather than that of one."""
     subdivides_early: Tensor
     """() bool: whether the finest level begins at EARLY_SUBDIVISION, and those before it accordingly."""
-    remembers: bool = True
-    """Whether weights that training finds are remembered; `update_cells` decides before each step."""
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
@@ -146,8 +141,8 @@ class LeanModel(RayModel):
         return self.loss(outputs, batch)
 
     def remember(self, rendered: Rendered) -> None:
-        """Remember the largest weight in each cell of what training has rendered, as long as cells are to be pruned."""
-        if self.remembers:
+        """Remember the largest weight in each cell of what training has rendered, if cells are to be subdivided yet."""
+        if self.grid.level < self.grid.max_level:
             self.grid.update_max_weight(rendered.cells, rendered.weights)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -227,13 +222,8 @@ class LeanModel(RayModel):
         if not grid.level and before < self._level_end(EARLY_SUBDIVISION, 0) <= now:
             self.subdivides_early.fill_(self._will_be_seen_often((1 - now) / now))
         begin, end = self._level_span()
-        since, part = ((progress - begin) / (end - begin) for progress in (before, now))
-        if since < UNSETTLED <= part:
+        if before < begin + UNSETTLED * (end - begin) <= now:
             grid.reset_max_weight()
-        is_finest = grid.level == grid.max_level
-        self.remembers = not is_finest or UNSETTLED <= part < LAST_PRUNING
-        if is_finest and since < LAST_PRUNING <= part:
-            self._leave_out_unseen()
         if grid.level < grid.max_level and before >= end and not grid.num_seen:
             raise _nothing_seen()
         # before that many weights are seen, nobody knows which cells are empty
@@ -269,14 +259,6 @@ class LeanModel(RayModel):
         if not seen.any():
             raise _nothing_seen()
         return self.grid.to_cells(seen)
-
-    def _leave_out_unseen(self) -> None:
-        """Leave out cells in which no color of training was, if enough was seen: what training leaves behind surfaces
-        would be seen from where no training view is."""
-        grid = self.grid
-        if grid.num_seen >= SEEN_PER_CELL * grid.occupied.sum():
-            grid.occupied &= (grid.max_weight > 0).reshape(grid.occupied.shape)
-            self.update_sampled()
 
     def _subdivide(self, remaining: float) -> bool:
         """Subdivide the cells that were seen, and those around them, as far as memory and what will be seen allow;
