@@ -80,10 +80,12 @@ def test_a_frame_is_rendered_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     whole, drawn = render_frame(WALL, CAMERAS, 1, OUTPUTS, 0.001), []
     monkeypatch.setattr(WALL, "chunks", lambda count: (slice(i, i + 10) for i in range(0, count, 10)))
     generate = Cameras.generate_rays
-    monkeypatch.setattr(Cameras, "generate_rays", lambda *args: drawn.append(args[2]) or generate(*args))
+    monkeypatch.setattr(Cameras, "generate_rays", lambda *args: drawn.append(args[1:]) or generate(*args))
     parts = render_frame(WALL, CAMERAS, 1, OUTPUTS, 0.001)
-    assert [len(coords) for coords in drawn] == [10, 10]
-    assert torch.equal(torch.cat(drawn), torch.cartesian_prod(torch.arange(4), torch.arange(5)) + 0.5)
+    assert [camera.tolist() for camera, _ in drawn] == [[[0]], [[0]]]
+    assert [len(coords) for _, coords in drawn] == [10, 10]
+    every = torch.cartesian_prod(torch.arange(4), torch.arange(5)) + 0.5
+    assert torch.equal(torch.cat([coords for _, coords in drawn]), every)
     for name in OUTPUTS:
         np.testing.assert_array_equal(parts[name], whole[name])
 
