@@ -76,7 +76,7 @@ def test_samples_colors_and_gradients_of_the_cells_are_the_cpu_s() -> None:
         density, features = (value.to(device).requires_grad_() for value in (density, features))
         weights = ColorNetwork(np.random.default_rng(0)).to(device).weights()
         spans = RaySpans(*(value.to(device) for value in (origins, directions, begin, end)))
-        marching = Marching(0.7, 1.0, 0.012, 0.006, 0.01)
+        marching = Marching(0.7, 1.0, 0.012, 0.006, 0.01, 0.4)
         rendered = voxel_ops.render(grid, density, features, weights, spans, jitter.to(device), marching)
         (rendered.rgb - target.to(device)).square().mean().backward()
         grads = [value.grad for value in (density, features)]

@@ -167,6 +167,47 @@ def test_weights_of_the_first_part_of_a_level_do_not_count() -> None:
     assert not model.grid.max_weight.any()
 
 
+@pytest.mark.parametrize(("times", "expected"), [(2560, 27 + 8 + 18), (2559, 512)])
+def test_finest_cells_far_from_those_seen_are_left_out_if_enough_was_seen(times: int, expected: int) -> None:
+    """Enough are 20 weights for each of 512 cells; those that count are inside the box, at its corner and edge; the
+    fourth does not."""
+    model = full_model(max_level=0)
+    x, y, z = torch.tensor([[1, 7, 4, 4], [1, 7, 7, 1], [1, 7, 1, 5]])
+    rows = 64 * model.grid.numbers[x // 4, y // 4, z // 4].long() + 16 * (x % 4) + 4 * (y % 4) + z % 4
+    weights = torch.tensor([0.05, 0.3, 1.0, 0.03])
+    model.update_cells(0.39, 0.4)
+    model.grid.update_max_weight(rows.repeat(times), weights.repeat(times))
+    model.update_cells(0.69, 0.695)
+    assert model.grid.occupied.sum() == 512
+    model.update_cells(0.695, 0.7)
+    assert model.grid.occupied.sum() == expected
+    found = model.grid.to_cells(model.grid.occupied.reshape(-1))
+    assert found[:3, :3, :3].all()
+    assert found[6:, 6:, 6:].all()
+    assert found[3:6, 6:, :3].all()
+    assert (unpack_bits(model.grid.sampled) == model.grid.occupied).all()
+
+
+def test_finest_cells_in_which_nothing_counts_are_an_error() -> None:
+    model = full_model(max_level=0)
+    model.grid.update_max_weight(torch.arange(512).repeat(20), torch.full((10240,), 0.01))
+    with pytest.raises(FloatingPointError, match="no cell has anything"):
+        model.update_cells(0.695, 0.7)
+
+
+def test_weights_are_remembered_only_while_they_will_be_looked_at() -> None:
+    model = full_model(max_level=0)
+    rendered = model.render(tiny_rays(50, dtype=torch.float32))[1]
+    assert len(rendered.cells)
+    remembered = []
+    for before, now in itertools.pairwise((0.0, 0.1, 0.41, 0.69, 0.71)):
+        model.update_cells(before, now)
+        seen = int(model.grid.num_seen)
+        model.remember(rendered)
+        remembered.append(int(model.grid.num_seen) > seen)
+    assert remembered == [False, True, True, False]
+
+
 def test_cells_that_have_become_transparent_are_not_sampled() -> None:
     model = full_model()
     with torch.no_grad():

@@ -23,7 +23,7 @@ from edge_se_sampler.models.voxel_kernels import rendering
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 
-MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01)
+MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01, 0.4)
 VIEWS = ball_views()
 
 
@@ -134,6 +134,25 @@ def test_two_renderings_before_a_backward_pass_do_not_share_memory() -> None:
     rendered(0.8).backward()
     assert features.grad is not None
     assert_close(features.grad.to_dense(), both, 1e-5)
+
+
+@pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
+def test_densities_that_little_light_reaches_have_no_gradient(ops: ModuleType) -> None:
+    """A ray through 12 cells in a row that each let 0.6 of the light pass: less than 0.1 behind the fifth."""
+    grid = BrickGrid.from_cells(torch.zeros(3), 1.0, torch.ones((12, 4, 4), dtype=torch.bool))
+    density = torch.nn.Parameter(torch.full((grid.num_rows, 1), float(np.log(0.5))))
+    features = torch.nn.Parameter(random_tensor(grid.num_rows, 16, seed=5))
+    ray = RaySpans(torch.full((1, 3), 0.5), torch.eye(3)[:1], torch.zeros(1), torch.full((1,), 11.5))
+    marching = Marching(1.0, 1.0, 0.01, 0.0, 0.0, visible_min=0.1)
+    weights = ColorNetwork(np.random.default_rng(0)).weights()
+    rendered = ops.render(grid, density, features, weights, ray, torch.zeros(1), marching)
+    (rendered.rgb.sum() + rendered.accumulation.sum()).backward()
+    for values, last in ((density, 5), (features, 12)):
+        gradient = values.grad
+        assert gradient is not None
+        rows = torch.nonzero(gradient.to_dense().abs().sum(dim=1))[:, 0]
+        cells = grid.coordinates(rows)[:, 0]
+        assert sorted(set(cells.tolist())) == list(range(last + 1))
 
 
 def gradients_of(ops: ModuleType) -> dict[str, torch.Tensor]:

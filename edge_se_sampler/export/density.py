@@ -32,7 +32,7 @@ def find_density(model: RayModel, opacity: float, find_box: Callable[[], BrickGr
     if isinstance(model, LeanModel):
         grid = model.grid
         raw = model.density.detach()[:, 0] + math.log(float(grid.cell_size / grid.finest_size))
-        return grid, torch.where(find_corners(grid), raw - threshold, -torch.inf)
+        return grid, torch.where(grid.find_corners(grid.occupied), raw - threshold, -torch.inf)
     assert isinstance(model, NeRFModel)
     grid = find_box().to(model.device) if model.grid is None else model.grid
     while True:
@@ -49,7 +49,7 @@ def find_density(model: RayModel, opacity: float, find_box: Callable[[], BrickGr
 @torch.no_grad()
 def _evaluate(model: NeRFModel, grid: BrickGrid) -> Tensor:
     """(64 K,) logarithm of density; minus infinity at what is no corner of an occupied cell."""
-    rows = torch.nonzero(find_corners(grid))[:, 0]
+    rows = torch.nonzero(grid.find_corners(grid.occupied))[:, 0]
     result = torch.full((grid.num_rows,), -torch.inf, dtype=model.dtype, device=model.device)
     any_direction = torch.zeros((1, 3), dtype=model.dtype, device=model.device)
     done = 0
@@ -62,12 +62,3 @@ def _evaluate(model: NeRFModel, grid: BrickGrid) -> Tensor:
     if result.isnan().any():
         raise FloatingPointError("the model's densities are not finite: training diverged; try a lower --optimizer.lr")
     return result
-
-
-def find_corners(grid: BrickGrid) -> Tensor:
-    """(64 K,) bool: the rows of corners of occupied cells."""
-    found = torch.zeros(grid.num_rows, dtype=torch.bool, device=grid.occupied.device)
-    for some in torch.arange(len(grid.bricks), device=found.device).split(2**13):
-        brick, cell = torch.nonzero(grid.occupied[some], as_tuple=True)
-        found[grid.corner_rows(some[brick], cell)] = True
-    return found

@@ -199,6 +199,9 @@ class LeanModelConfig(ModelConfig):
     """Samples that count less in their ray's color are not asked for one."""
     transmittance_threshold: float = 0.006
     """A ray ends where less of its light passes."""
+    visible_threshold: float = field(default=0.05, metadata=ADDED_LATER)
+    """Where less of a ray's light arrives, training changes the color, but not the density: else what a surface lets
+    through would make opaque what is behind it, which other views may see beside it."""
     prune_weight: float = 0.04
     """Cells that never counted more in a ray's color are pruned."""
     density_lr_scale: float = 30.0
@@ -235,7 +238,8 @@ class LeanModelConfig(ModelConfig):
         check_value(f"{prefix}step-size-voxels", step, 0.05 <= step < INFINITY, "at least 0.05")
         share = self.near_share
         check_value(f"{prefix}near-share", share, share is None or 0 <= share < 1, "in [0, 1)")
-        for name in ("alpha_threshold", "weight_threshold", "transmittance_threshold", "prune_weight"):
+        thresholds = ("alpha_threshold", "weight_threshold", "transmittance_threshold", "visible_threshold")
+        for name in (*thresholds, "prune_weight"):
             value = getattr(self, name)
             check_value(prefix + name.replace("_", "-"), value, 0 <= value < 1, "in [0, 1)")
         for name in ("total_variation", "alpha_loss"):

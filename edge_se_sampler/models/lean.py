@@ -20,10 +20,11 @@ from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.levels import LAST_PRUNING, UNSETTLED, find_level, find_level_end
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
 from edge_se_sampler.models.voxel_backend import choose_ops
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
-from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 from edge_se_sampler.occupancy.saved_grid import MAX_SIZE
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
@@ -34,13 +35,10 @@ INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
 INITIAL_DEPTH, INITIAL_DEPTH_CARVED = 1.0, 8.5
 """Optical depth that the box would have at first, if cells filled it; the latter where masks carve them close to the
 object: more hides what is behind, and each view would learn a picture of its own on it."""
-LAST_SUBDIVISION, EARLY_SUBDIVISION, LEVEL_RATIO = 0.45, 0.3, 0.45
-"""Part of the training after which the finest level begins; the same where each cell will be seen often; and by which
-each level ends before the next one does."""
 SEEN_PER_ROW = 22
 """How many weights will then be seen for each row that the finest level is expected to have."""
-UNSETTLED = 0.4
-"""Part of a level whose weights are not looked at when cells are pruned: they still move."""
+SEEN_PER_CELL = 20
+"""How many weights must have been seen for each cell by then: else nobody knows which count."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
 """Part of the training after which a pixel has 2 x 2 rays, and how often all of them must have been trained on before:
 more rays tell more of what is smaller than a pixel, but other pixels tell more of what is not yet known."""
@@ -87,7 +85,9 @@ class LeanModel(RayModel):
     supersampled: Tensor
     """() bool: whether a pixel's color is the mean over 2 x 2 rays through it, rather than that of one."""
     subdivides_early: Tensor
-    """() bool: whether the finest level begins at EARLY_SUBDIVISION, and those before it accordingly."""
+    """() bool: whether levels begin early, see `find_level`."""
+    remembers_weights: bool = True
+    """Whether weights are remembered, as `update_cells` decides."""
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
@@ -116,7 +116,7 @@ class LeanModel(RayModel):
         density_scale = step * float(self.grid.cell_size / self.grid.finest_size)
         config = self.config
         thresholds = config.alpha_threshold, config.weight_threshold, config.transmittance_threshold
-        return Marching(step, density_scale, *thresholds)
+        return Marching(step, density_scale, *thresholds, config.visible_threshold)
 
     @property
     def rays_per_chunk(self) -> int:
@@ -141,8 +141,8 @@ class LeanModel(RayModel):
         return self.loss(outputs, batch)
 
     def remember(self, rendered: Rendered) -> None:
-        """Remember the largest weight in each cell of what training has rendered, if cells are to be subdivided yet."""
-        if self.grid.level < self.grid.max_level:
+        """Remember the largest weight in each cell of what training has rendered, while that will be looked at."""
+        if self.remembers_weights:
             self.grid.update_max_weight(rendered.cells, rendered.weights)
 
     def loss(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -220,15 +220,20 @@ class LeanModel(RayModel):
         """Do what is due as training goes on from one part of it to the next, both in [0, 1]; tells whether cells were
         subdivided. FloatingPointError: they hold nothing."""
         grid = self.grid
-        if not grid.level and before < self._level_end(EARLY_SUBDIVISION, 0) <= now:
+        level, finest = int(grid.level), int(grid.max_level)
+        if not level and before < find_level_end(0, finest, is_early=True) <= now:
             self.subdivides_early.fill_(self._will_be_seen_often((1 - now) / now))
-        begin, end = self._level_span()
-        if before < begin + UNSETTLED * (end - begin) <= now:
+        begin, end = find_level(level, finest, bool(self.subdivides_early))
+        done, part = ((progress - begin) / (end - begin) for progress in (before, now))
+        if done < UNSETTLED <= part:
             grid.reset_max_weight()
-        if grid.level < grid.max_level and before >= end and not grid.num_seen:
+        if level == finest and done < LAST_PRUNING <= part:
+            self._leave_out_unseen()
+        self.remembers_weights = level < finest or UNSETTLED <= part < LAST_PRUNING
+        if level < finest and before >= end and not grid.num_seen:
             raise _nothing_seen()
         # before that many weights are seen, nobody knows which cells are empty
-        if grid.level < grid.max_level and now >= end and grid.num_seen >= grid.occupied.sum():
+        if level < finest and now >= end and grid.num_seen >= grid.occupied.sum():
             return self._subdivide((1 - now) / now)
         return False
 
@@ -238,16 +243,6 @@ class LeanModel(RayModel):
         least = self.marching.density_min - TRANSPARENT_MARGIN
         self.grid.set_sampled(choose_ops(self.density).find_dense_cells(self.grid, self.density, least))
 
-    def _level_span(self) -> tuple[float, float]:
-        """Parts of the training at which the grid's level begins and ends."""
-        last, level = EARLY_SUBDIVISION if self.subdivides_early else LAST_SUBDIVISION, int(self.grid.level)
-        begin = self._level_end(last, level - 1) if level else 0.0
-        return begin, self._level_end(last, level) if level < self.grid.max_level else 1.0
-
-    def _level_end(self, last: float, level: int) -> float:
-        """Part of the training after which a level ends, all before the finest one, which begins after `last`."""
-        return last * LEVEL_RATIO ** (int(self.grid.max_level) - level - 1)
-
     def _will_be_seen_often(self, remaining: float) -> bool:
         """Whether weights will be seen often enough for the finest level to begin early, judged by those of this level,
         the first; remaining: as `_subdivide`."""
@@ -255,11 +250,20 @@ class LeanModel(RayModel):
         return remaining * int(self.grid.num_seen) >= SEEN_PER_ROW * expected_rows
 
     def _find_seen(self) -> Tensor:
-        """(X, Y, Z) bool: cells that had a weight in some color. FloatingPointError: there are none."""
-        seen = self.grid.occupied.reshape(-1) & (self.grid.max_weight > self.config.prune_weight)
+        """(K, 64) bool: cells that had a weight in some color. FloatingPointError: there are none."""
+        seen = self.grid.occupied & (self.grid.max_weight.view(self.grid.occupied.shape) > self.config.prune_weight)
         if not seen.any():
             raise _nothing_seen()
-        return self.grid.to_cells(seen)
+        return seen
+
+    def _leave_out_unseen(self) -> None:
+        """Leave out cells but those that were seen and those around them, if enough was seen: what surfaces let
+        through at first has made some behind them opaque, which views from elsewhere would see."""
+        grid = self.grid
+        if grid.num_seen >= SEEN_PER_CELL * grid.occupied.sum():
+            near = grid.find_corners(self._find_seen())[:, None].to(self.dtype)
+            grid.occupied &= unpack_bits(choose_ops(near).find_dense_cells(grid, near, 0.0))
+            self.update_sampled()
 
     def _subdivide(self, remaining: float) -> bool:
         """Subdivide the cells that were seen, and those around them, as far as memory and what will be seen allow;
@@ -269,7 +273,7 @@ class LeanModel(RayModel):
             remaining: how much longer than until now the training goes on.
         """
         grid = self.grid
-        finer = self._find_finer(self._find_seen(), remaining)
+        finer = self._find_finer(grid.to_cells(self._find_seen()), remaining)
         if finer is None:
             grid.max_level -= 1
             grid.reset_max_weight()

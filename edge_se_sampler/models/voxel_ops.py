@@ -38,6 +38,8 @@ class Marching:
     """Samples of less weight have no color: black, at their full opacity."""
     transmittance_min: float
     """A ray ends where less light passes."""
+    visible_min: float
+    """Densities of samples that less light reaches have no gradient."""
 
     @property
     def density_min(self) -> float:
@@ -69,6 +71,8 @@ class Samples:
     """(m, 8): their shares in what is interpolated."""
     colored: Tensor
     """(c,) int64: which samples have a color."""
+    visible: Tensor
+    """(m,) bool: which samples' densities have a gradient."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,7 @@ def render(
     num_rays, samples = len(spans.begin), march(grid, density, spans, jitter, marching)
     colored = samples.colored
     tau = torch.exp(interpolate(density, samples.rows, samples.weights)[:, 0]) * marching.density_scale
+    tau = torch.where(samples.visible, tau, tau.detach())
     values = interpolate(features, samples.rows, samples.weights)[colored]
     color = shade(values, spans.directions, samples.ray_indices[colored], network)
     rgb, accumulation, weights = composite(tau, color, samples, num_rays)
@@ -134,7 +139,8 @@ def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | No
     passing = torch.cat((torch.ones_like(begin), passing.cumprod(dim=1)), dim=1)[ray, index]
     kept = opaque & (passing >= marching.transmittance_min)
     colored = torch.nonzero((passing * alpha > marching.weight_min)[kept])[:, 0]
-    return Samples(t[ray, index][kept], ray[kept], rows[kept].int(), weights[kept], colored)
+    visible = (passing >= marching.visible_min)[kept]
+    return Samples(t[ray, index][kept], ray[kept], rows[kept].int(), weights[kept], colored, visible)
 
 
 def find_dense_cells(grid: BrickGrid, density: Tensor, least: float) -> Tensor:

@@ -240,6 +240,14 @@ class BrickGrid(nn.Module):
         brick = torch.gather(self.neighbors[bricks].long(), 1, neighbor)
         return torch.where(brick < 0, -1, 64 * brick + corner)
 
+    def find_corners(self, cells: Tensor) -> Tensor:
+        """(64 K,) bool: the rows of corners of those of the occupied cells, (K, 64) bool."""
+        found = torch.zeros(self.num_rows, dtype=torch.bool, device=cells.device)
+        for some in torch.arange(len(cells), device=cells.device).split(2**13):
+            brick, cell = torch.nonzero(cells[some], as_tuple=True)
+            found[self.corner_rows(some[brick], cell)] = True
+        return found
+
     def to_cell_units(self, positions: Tensor) -> Tensor:
         """Positions (m, 3), world units, in sides of a cell from the box's least coordinates; float64, where their
         device has it."""

@@ -69,6 +69,7 @@ class _Render(torch.autograd.Function):
             samples = int(1.25 * found)
         seen = _collect_seen(buffers) if keep else (np.empty(0, np.int64), np.empty(0, np.float32))
         ctx.arrays, ctx.num_rows = (outputs[1], network, buffers), len(density)
+        ctx.visible_min = f32(marching.visible_min)
         if not keep:
             _spare.append(buffers)
         tensors = tuple(map(torch.from_numpy, (*outputs, *seen)))
@@ -81,7 +82,8 @@ class _Render(torch.autograd.Function):
         d_rgb, d_accumulation = (gradient.contiguous().numpy() for gradient in gradients[:2])
         of_network = network.zeros(min(len(buffers.ends), NUM_SUMS))
         transposed = network.hidden.reshape(FEATURES, WIDTH).T.ravel()
-        _render_backward(d_rgb, d_accumulation, accumulation, network, transposed, buffers, of_network)
+        of_rays = d_rgb, d_accumulation, accumulation
+        _render_backward(*of_rays, ctx.visible_min, network, transposed, buffers, of_network)
         of_rows = sum_row_gradients(buffers, ctx.num_rows)
         del ctx.arrays  # the buffers hold gradients now: there is no second backward pass
         _spare.append(buffers)
@@ -174,18 +176,18 @@ def _collect_seen(buffers):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _render_backward(d_rgb, d_accumulation, accumulation, network, transposed, buffers, gradient):
+def _render_backward(d_rgb, d_accumulation, accumulation, visible_min, network, transposed, buffers, gradient):
     """Gradients of the network, in several sums, and, in the buffers, of raw densities and features of samples."""
     num_sums = len(gradient.color_bias)
     for number in prange(num_sums):
         for slot in range(number, len(buffers.ends), num_sums):
             # functions of their own: numba would drop what is written to a tuple's arrays in a parallel loop
-            _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers)
+            _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, visible_min, buffers)
             _shade_chunk_backward(slot, number, network, transposed, buffers, gradient)
 
 
 @njit(cache=True, error_model="numpy", fastmath=CONTRACT)
-def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers):
+def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, visible_min, buffers):
     start, first = 0, slot * CHUNK
     for i in range(first, min(first + CHUNK, len(d_rgb))):
         end = buffers.ends[slot, i - first]
@@ -200,7 +202,7 @@ def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, buffers
                     color, d = buffers.color[slot, 3 * index + channel], d_rgb[i, channel]
                     d_sample += d * color
                     buffers.color[slot, 3 * index + channel] = (passing - after) * d * color * (f32(1) - color)
-            buffers.tau[slot, k] = (after * d_sample - behind) * tau
+            buffers.tau[slot, k] = (after * d_sample - behind) * tau if passing >= visible_min else f32(0)
             behind += (passing - after) * d_sample
         start = end
 
