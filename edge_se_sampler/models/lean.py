@@ -38,7 +38,7 @@ object: more hides what is behind, and each view would learn a picture of its ow
 SEEN_PER_ROW = 22
 """How many weights will then be seen for each row that the finest level is expected to have."""
 SEEN_PER_CELL = 20
-"""How many weights must have been seen for each cell by then: else nobody knows which count."""
+"""How many weights must have been seen for each of the finest cells before some are left out."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
 """Part of the training after which a pixel has 2 x 2 rays, and how often all of them must have been trained on before:
 more rays tell more of what is smaller than a pixel, but other pixels tell more of what is not yet known."""
