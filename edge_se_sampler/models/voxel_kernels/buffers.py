@@ -20,7 +20,7 @@ class Buffers(NamedTuple):
 
     ends: np.ndarray  # (S, CHUNK) int32: end of each ray's samples
     num_colored: np.ndarray  # (S,) int32
-    rows: np.ndarray  # (S, 8 M) int32: of a sample's corners
+    rows: np.ndarray  # (S, 8 M) int32: of a sample's corners; in the backward pass they become places among all touched
     weights: np.ndarray  # (S, 8 M): of the corners
     t: np.ndarray  # (S, M)
     tau: np.ndarray  # (S, M); in the backward pass it becomes the gradient of the raw density

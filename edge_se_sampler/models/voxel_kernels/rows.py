@@ -15,8 +15,8 @@ from torch import Tensor
 from edge_se_sampler.models.voxel_kernels.buffers import FEATURES, Buffers
 from edge_se_sampler.models.voxel_kernels.simd import load, minimum, prefetch, splat, store, total
 
-AHEAD = 8
-"""Rows that are fetched into the cache before they are needed."""
+AHEAD, CORNERS_AHEAD = 8, 48
+"""Rows, and corners of samples, that are fetched into the cache before they are needed."""
 f32 = np.float32
 
 
@@ -34,7 +34,7 @@ def sum_row_gradients(buffers: Buffers, num_rows: int) -> tuple[Tensor, Tensor]:
     that samples touch, ascending."""
     threads = numba.get_num_threads()
     touched, firsts = _number_rows(buffers.ends, buffers.rows, num_rows // 64, threads)
-    rows, *sums = _scatter(buffers, touched, firsts, 1 << (threads - 1).bit_length())
+    rows, *sums = _scatter(buffers, touched, firsts, threads)
     indices = torch.from_numpy(rows)[None]
 
     def sparse(values: Tensor) -> Tensor:
@@ -73,35 +73,49 @@ def _count_bits(bits):
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
-def _scatter(buffers, touched, firsts, parts):
-    """Rows that samples touch, ascending, and the sums of their gradients. Each thread goes through all samples, in
-    their order, and adds up those of its own bricks: the sums are the same for any number of threads. `parts` is a
-    power of two."""
-    indices = np.empty(firsts[-1], np.int64)
-    density, features = np.zeros((firsts[-1], 1), np.float32), np.zeros(firsts[-1] * FEATURES, np.float32)
-    for part in prange(parts):
+def _scatter(buffers, touched, firsts, threads):
+    """Rows that samples touch, ascending, and the sums of their gradients; in the buffers, rows become their places in
+    these. Each thread goes through all samples, in their order, and adds up what belongs to its share of the rows: the
+    sums are the same for any number of threads."""
+    count = firsts[-1]
+    indices = np.empty(count, np.int64)
+    density, features = np.empty((count, 1), np.float32), np.empty(count * FEATURES, np.float32)
+    for slot in prange(len(buffers.ends)):
+        _find_places(buffers.rows[slot], 8 * buffers.ends[slot, -1], touched, firsts, indices)
+    for thread in prange(threads):
+        first, last = thread * count // threads, (thread + 1) * count // threads
+        density[first:last] = f32(0)
+        features[FEATURES * first : FEATURES * last] = f32(0)
         for slot in range(len(buffers.ends)):
-            _scatter_chunk(buffers, slot, touched, firsts, parts, part, indices, density, features)
+            _scatter_chunk(buffers, slot, first, last, density, features)
     return indices, density, features.reshape(-1, FEATURES)
 
 
 @njit(cache=True, error_model="numpy")
-def _scatter_chunk(buffers, slot, touched, firsts, parts, part, indices, density, features):
-    gradients = buffers.features[slot]
+def _find_places(rows, count, touched, firsts, indices):
+    for c in range(count):
+        row = rows[c]
+        brick, bit = row >> 6, np.int64(1) << (row & 63)
+        rows[c] = firsts[brick] + _count_bits(touched[brick] & (bit - 1))
+        indices[rows[c]] = row  # several threads may write it, all the same
+
+
+@njit(cache=True, error_model="numpy")
+def _scatter_chunk(buffers, slot, first, last, density, features):
+    gradients, places, weights = buffers.features[slot], buffers.rows[slot], buffers.weights[slot]
+    end = 8 * buffers.ends[slot, -1]
     for i in range(buffers.ends[slot, -1]):
         index = buffers.color_index[slot, i]
         gradient = load(gradients, FEATURES * max(index, 0))
         for c in range(8 * i, 8 * i + 8):
-            row, weight = buffers.rows[slot, c], buffers.weights[slot, c]
-            brick, bit = row >> 6, np.int64(1) << (row & 63)
-            if (brick >> 6) & (parts - 1) != part:
-                continue
-            number = firsts[brick] + _count_bits(touched[brick] & (bit - 1))
-            indices[number] = row
-            density[number, 0] += weight * buffers.tau[slot, i]
-            if index >= 0:
-                at = FEATURES * number
-                store(features, at, load(features, at) + splat(weight) * gradient)
+            later, place = np.int64(places[min(c + CORNERS_AHEAD, end - 1)]), np.int64(places[c])
+            if first <= later < last:
+                prefetch(features, FEATURES * later)
+            if first <= place < last:
+                density[place, 0] += weights[c] * buffers.tau[slot, i]
+                if index >= 0:
+                    at = FEATURES * place
+                    store(features, at, load(features, at) + splat(weights[c]) * gradient)
 
 
 def adam_rows(
