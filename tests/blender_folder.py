@@ -22,12 +22,13 @@ def pixels(seed: int, width: int = WIDTH, height: int = HEIGHT, channels: int = 
 
 
 def pose(seed: int) -> list[list[float]]:
-    """A random rigid 4x4 matrix."""
+    """A random rigid 4x4 matrix, as far from the origin as NeRF's cameras are."""
     rng = np.random.default_rng(seed)
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
-    matrix[:3, 3] = rng.normal(size=3)
+    position = rng.normal(size=3)
+    matrix[:3, 3] = 4 * position / np.linalg.norm(position)
     return matrix.tolist()
 
 

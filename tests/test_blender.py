@@ -27,6 +27,8 @@ from blender_folder import (
 )
 
 from edge_se_sampler.data.blender import has_split, read_blender
+from edge_se_sampler.data.dataset import list_frames, read_split
+from edge_se_sampler.errors import InputError
 
 
 @pytest.fixture
@@ -222,6 +224,29 @@ def test_links_inside_the_folder_and_to_the_folder_are_followed(tmp_path: Path) 
 def test_a_byte_order_mark_is_skipped(tmp_path: Path, doc: dict[str, Any]) -> None:
     (tmp_path / "transforms_train.json").write_text(json.dumps(doc), encoding="utf-8-sig")
     assert len(read_blender(tmp_path, "train").names) == 3
+
+
+@pytest.mark.parametrize("frames", ["of images", "none"])
+def test_a_held_out_split_that_nobody_rendered_is_left_out(
+    frames: str, tmp_path: Path, doc: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Blender's add-ons write one: cameras without images, or an empty list."""
+    listed = [frame | {"file_path": f"test/{i:04}.png"} for i, frame in enumerate(doc["frames"])]
+    write_json(tmp_path, doc | {"frames": listed if frames == "of images" else []}, "test")
+    assert read_split(tmp_path, "test") is None
+    assert "transforms_test.json: none of its images exists: left out" in capsys.readouterr().err
+    assert list_frames(tmp_path, "test") == []
+    (tmp_path / "test").mkdir()
+    iio.imwrite(tmp_path / "test/0001.png", pixels(1))
+    if frames == "of images":  # then the others are missing
+        with pytest.raises(InputError, match=r"frames\[0\].file_path: 'test/0000.png' does not exist"):
+            read_split(tmp_path, "test")
+
+
+def test_a_training_split_without_images_is_an_error(tmp_path: Path, doc: dict[str, Any]) -> None:
+    write_json(tmp_path, doc | {"frames": []})
+    with pytest.raises(InputError, match="frames: is empty"):
+        read_split(tmp_path, "train")
 
 
 def test_has_split(tmp_path: Path, doc: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,12 @@ from capture_folder import (
     HEIGHT,
     NAMES,
     OPENCV,
+    PINHOLE,
     ROW_STEP,
     SQUARE_PIXELS,
     WIDTH,
     Distortion,
+    colmap_files,
     picture,
     points,
     poses,
@@ -263,3 +266,46 @@ def test_images_may_lie_anywhere_in_the_folder(tmp_path: Path) -> None:
     document["frames"][0]["file_path"] = f"a/b/{NAMES[0]}"
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     assert read(tmp_path, "test").names[0] == f"a/b/{NAMES[0]}"
+
+
+def test_the_largest_of_several_models_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """COLMAP makes several where it cannot connect all images, the first not always the largest."""
+    write_colmap(tmp_path, sparse="sparse/1")
+    (tmp_path / "sparse/0").mkdir()
+    for name in ("cameras", "points3D"):
+        shutil.copy(tmp_path / f"sparse/1/{name}.bin", tmp_path / "sparse/0")
+    two = colmap_files(PINHOLE, text=True)["images.txt"].split(b"\n")[:6]
+    (tmp_path / "sparse/0/images.txt").write_bytes(b"\n".join(two))
+    assert len(read(tmp_path).names) == COUNT - 2
+    assert "sparse/1: the largest of 2 models" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "sparse/1")
+    assert len(read(tmp_path, eval_every=2).names) < 3
+    assert not capsys.readouterr().err
+
+
+def test_paths_written_on_windows(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    for frame in document["frames"]:
+        frame["file_path"] = frame["file_path"].replace("/", "\\")
+    document["train_filenames"] = [frame["file_path"] for frame in document["frames"][1:]]
+    document["test_filenames"] = [document["frames"][0]["file_path"]]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert read(tmp_path).names == tuple(f"images/{name}" for name in NAMES[1:])
+    assert read(tmp_path, "test").names == (f"images/{NAMES[0]}",)
+    odd = "images\\odd.png"  # is a name here, too
+    shutil.copy(tmp_path / "images" / NAMES[3], tmp_path / odd)
+    document["frames"][0]["file_path"] = document["test_filenames"][0] = odd
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    np.testing.assert_array_equal(read(tmp_path, "test").images[0], picture(3))
+
+
+def test_coefficients_in_quotes(tmp_path: Path) -> None:
+    """As nerfstudio writes those of RealityCapture."""
+    document = write_transforms(tmp_path, OPENCV)
+    expected = read(tmp_path).images[2]
+    for frame in document["frames"]:
+        frame |= {key: str(document[key]) for key in OPENCV.terms}
+    for key in OPENCV.terms:
+        del document[key]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    np.testing.assert_array_equal(read(tmp_path).images[2], expected)

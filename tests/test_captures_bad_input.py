@@ -75,7 +75,9 @@ def put(document: dict[str, Any], key: str, value: Any) -> None:
         ("frames 2 camera_model", "FOV", r"frames\[2\]\.camera_model"),
         ("is_fisheye", "yes", "is_fisheye: must be true or false"),
         ("equirectangular", True, "equirectangular: is of a camera"),
-        ("k1", "0.1", "k1: must be a number"),
+        ("k1", "0,1", "k1: must be a number"),
+        ("k2", "nan", "k2: must be a number"),
+        ("fl_x", "40", "fl_x: must be a number"),
         ("k4", 0.1, "k4: is not supported of a lens that is none"),
         ("frames 1 p1", None, r"frames\[1\]\.p1: must be a number"),
         ("k1", float("nan"), "k1: is NaN"),
@@ -126,12 +128,17 @@ def test_a_name_that_is_too_long_is_of_an_image_that_is_not_there(
 
 
 def test_cameras_too_far_from_the_origin_to_be_told_apart(tmp_path: Path) -> None:
+    """As those of surveys are, whose coordinates are of a country or the earth."""
     document = write_transforms(tmp_path, PINHOLE)
     for frame in document["frames"]:
-        frame["transform_matrix"][0][3] += 5e6
+        frame["transform_matrix"][0][3] += 1e4
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert read_split(tmp_path, "train") is not None
+    for frame in document["frames"]:
+        frame["transform_matrix"][0][3] += 9e4
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     assert re.search(
-        r"transforms.json: its cameras are 5e\+06 from the origin, but only .* from each", refusal(tmp_path)
+        r"transforms.json: its cameras are 1e\+05 from the origin, but only .* from each", refusal(tmp_path)
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,6 +107,22 @@ def test_nerfs_own_scenes_keep_2_and_6(scene: Path, tmp_path: Path) -> None:
     assert read_blender(scene, "train").depths == (2.0, 6.0)
     write_blender(tmp_path / "real")
     assert read_blender(tmp_path / "real", "train").depths is None
+
+
+@pytest.mark.parametrize(("scale", "is_nerfs"), [(1.0, True), (2.4, False), (0.6, False)])
+def test_scenes_of_another_size_have_depths_of_their_own(scale: float, is_nerfs: bool, tmp_path: Path) -> None:
+    """Blender's add-ons write an angle of view, too, wherever the cameras are."""
+    document = write_blender(tmp_path)
+    frames = document["frames"]
+    for frame in frames:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= scale
+    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    views = read_blender(tmp_path, "train")
+    assert (views.depths == (2.0, 6.0)) == is_nerfs
+    found = find_depths(views)
+    assert ((found.near, found.far) == (2.0, 6.0)) == is_nerfs
+    assert found.near < 4 * scale < found.far
 
 
 def test_the_config_records_depths_and_flags_insist(tmp_path: Path) -> None:

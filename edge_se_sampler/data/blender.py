@@ -6,11 +6,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, load_views
 from edge_se_sampler.data.scene_file import JsonValue, SourceLocation, check_folder, read_json
 from edge_se_sampler.data.transforms_frames import read_entries, read_frames
-from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, Views
+from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, NERF_SYNTHETIC_DISTANCES, Views
 
 
 def transforms_path(folder: Path, split: str) -> Path:
@@ -20,6 +22,18 @@ def transforms_path(folder: Path, split: str) -> Path:
 def has_split(folder: Path, split: str) -> bool:
     """Whether the folder has a transforms_<split>.json."""
     return os.path.exists(transforms_path(Path(folder), split))
+
+
+def has_views(folder: Path, split: str) -> bool:
+    """Whether the json of a split lists images of which some exist: add-ons list cameras that nobody renders.
+    InputError as `read_blender`, of the json."""
+    if not has_split(folder, split):
+        return False
+    top = read_json(transforms_path(folder, split))
+    listed = top.optional("frames")
+    if listed is not None and not listed.list():
+        return False
+    return any(os.path.exists(entry.image.path) for entry in read_entries(top, folder))
 
 
 def read_blender(
@@ -32,10 +46,17 @@ def read_blender(
     returned as written (not moved, scaled or orthonormalized). A frame without a mask is trained on as a whole.
     InputError for anything that cannot be used: first of the folder, then of the json, then of the images."""
     frames, top = list_frames(Path(folder), split)
+    depths = NERF_SYNTHETIC_DEPTHS if _is_of_nerf(top, frames) else None
     views = load_views(settings.choose(frames), settings, progress)
-    # real scenes, whose units are their own, state focal lengths in pixels alone
-    depths = NERF_SYNTHETIC_DEPTHS if "camera_angle_x" in top.object() else None
     return replace(views, depths=depths, data_format="blender")
+
+
+def _is_of_nerf(top: JsonValue, frames: list[Frame]) -> bool:
+    """Whether a scene is as large as NeRF's own. Others, whose units are their own, have cameras elsewhere, or state
+    focal lengths in pixels alone."""
+    distance = np.median([np.linalg.norm(frame.pose[:, 3]) for frame in frames])
+    nearest, farthest = NERF_SYNTHETIC_DISTANCES
+    return "camera_angle_x" in top.object() and bool(nearest < distance < farthest)
 
 
 def list_frames(folder: Path, split: str) -> tuple[list[Frame], JsonValue]:

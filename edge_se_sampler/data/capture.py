@@ -25,8 +25,8 @@ class Capture:
     """The frames of a folder, in the order of their names."""
 
     frames: list[Frame]
-    missing: str
-    """What was left out because it does not exist, in a line; "": nothing."""
+    left_out: list[str]
+    """Lines that say what the folder lists or has, but is not used."""
     splits: dict[Split, list[int]] | None = None
     """Indices of the frames of each split; None: the data has none."""
     points: list[np.ndarray] | None = None
@@ -41,14 +41,14 @@ class Capture:
 
 def keep_existing(
     items: Sequence[Item], images: Sequence[SourceFile], listing: SourceLocation
-) -> tuple[list[Item], str]:
-    """The items whose images exist, and a line about the others; InputError if fewer than half of them do."""
+) -> tuple[list[Item], list[str]]:
+    """The items whose images exist, and a line about the others, if any; InputError if fewer than half of them do."""
     exist = [os.path.exists(image.path) for image in images]  # Path.exists() raises where a name is too long
     kept = list(itertools.compress(items, exist))
     if len(kept) == len(items):
-        return kept, ""
+        return kept, []
     first = images[exist.index(False)]
     found = f"{len(items) - len(kept)} of the {len(items)} listed images do not exist, {quote(first.name)} for one"
     if 2 * len(kept) < len(items):
         raise listing.error(found, "put them there, or list only what is there")
-    return kept, f"{listing.file}: {found}: left out"
+    return kept, [f"{listing.file}: {found}: left out"]

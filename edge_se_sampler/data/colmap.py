@@ -11,7 +11,7 @@ from edge_se_sampler.data.capture import Capture, keep_existing
 from edge_se_sampler.data.colmap_model import (
     ColmapCamera,
     ColmapImage,
-    find_model,
+    find_models,
     read_cameras,
     read_images,
     read_points,
@@ -32,8 +32,7 @@ def read_colmap(folder: Path) -> Capture:
     has its image's path in the folder `masks` (masks_2 for images_2, ...), with .png added or in place of the suffix,
     or that of the file that it is a link to; an image without one is not masked. InputError for files that cannot be
     used, or if fewer than half of the images exist."""
-    model = find_model(folder)
-    assert model is not None
+    model, *others = find_models(folder)
     cameras, listed = read_cameras(model), read_images(model)
     images_folder = find_images(folder)
     listed.sort(key=lambda image: image.name)
@@ -42,7 +41,9 @@ def read_colmap(folder: Path) -> Capture:
     for image in listed:
         if image.camera_id not in cameras:
             raise image.location.error(f"there is no camera {image.camera_id}", "copy the whole model")
-    pairs, missing = keep_existing(list(zip(listed, files, strict=True)), files, SourceLocation(files[0].location.file))
+    pairs, left_out = keep_existing(
+        list(zip(listed, files, strict=True)), files, SourceLocation(files[0].location.file)
+    )
     headers = read_headers([file for _, file in pairs])
     masks_folder = folder / images_folder.name.replace("images", "masks")
     masks = [_find_mask(image, masks_folder) or find_mask(folder, file) for image, file in pairs]
@@ -50,7 +51,9 @@ def read_colmap(folder: Path) -> Capture:
         _frame(image, cameras[image.camera_id], file, header, mask)
         for (image, file), header, mask in zip(pairs, headers, masks, strict=True)
     ]
-    return Capture(frames, missing, points=_points_of(model, [image for image, _ in pairs]))
+    if others:
+        left_out.append(f"{model}: the largest of {1 + len(others)} models, of which the others are left out")
+    return Capture(frames, left_out, points=_points_of(model, [image for image, _ in pairs]))
 
 
 def find_images(folder: Path) -> Path:
@@ -74,7 +77,7 @@ def _frame(
     def matches(header: ImageHeader) -> bool:
         return abs(header.height - header.width * camera.height / camera.width) <= ROUNDING
 
-    header = choose_orientation(file, header, matches)
+    header = choose_orientation(file, header, matches, prefers_stored=True)  # COLMAP itself turns none
     if not matches(header):
         problem = f"is {header.width} x {header.height} pixels, its camera's images {camera.width} x {camera.height}"
         raise file.error(problem, "use the images that the model was made of, or scaled ones")

@@ -60,12 +60,16 @@ class ColmapImage:
     """(m,) int64: the points that it sees, -1 for features that are none."""
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder with cameras, images and points3D of a scene, if there is one."""
-    for path in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
-        if any((path / f"cameras.{suffix}").exists() for suffix in ("bin", "txt")):
-            return path
-    return None
+def find_models(folder: Path) -> list[Path]:
+    """The folders with cameras, images and points3D of a scene, the one to read first: where COLMAP could not connect
+    all images and made several, the one with the largest list of them."""
+    for sparse in (folder / "sparse", folder / "colmap" / "sparse"):
+        numbered = [path for path in sorted(sparse.glob("*")) if path.name.isdecimal()]
+        if models := [path for path in numbered if _file_of(path, "cameras").exists()]:
+            return sorted(models, key=lambda model: -_size_of(model, "images"))
+        if _file_of(sparse, "cameras").exists():
+            return [sparse]
+    return []
 
 
 def read_cameras(model: Path) -> dict[int, ColmapCamera]:
@@ -111,6 +115,11 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
 def _file_of(model: Path, name: str) -> Path:
     binary = model / f"{name}.bin"
     return binary if binary.exists() else model / f"{name}.txt"
+
+
+def _size_of(model: Path, name: str) -> int:
+    file = _file_of(model, name)
+    return file.stat().st_size if file.exists() else 0
 
 
 def _camera(location: SourceLocation, name: str, values: list[float]) -> ColmapCamera:

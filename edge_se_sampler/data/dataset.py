@@ -6,11 +6,11 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from edge_se_sampler.data.blender import has_split, read_blender, transforms_path
+from edge_se_sampler.data.blender import has_split, has_views, read_blender, transforms_path
 from edge_se_sampler.data.blender import list_frames as list_blender_frames
 from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Capture, Split
 from edge_se_sampler.data.colmap import read_colmap
-from edge_se_sampler.data.colmap_model import find_model
+from edge_se_sampler.data.colmap_model import find_models
 from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
@@ -54,7 +54,7 @@ def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
         found.append("blender")
     if (folder / "transforms.json").exists():
         found.append("transforms")
-    if find_model(folder) is not None:
+    if find_models(folder):
         found.append("colmap")
     if bounds_path(folder).exists():
         found.append("llff")
@@ -83,7 +83,9 @@ def read_split(
     load = LoadSettings(settings.masks, settings.downscale, settings.model_memory, settings.select)
     if data_format == "blender":
         _check_unsplit(settings, has_own_split=True)
-        if split != "train" and not has_split(folder, split):
+        if split != "train" and not has_views(folder, split):
+            if has_split(folder, split):
+                print(f"{transforms_path(folder, split)}: none of its images exists: left out", file=sys.stderr)
             return None
         return read_blender(folder, split, load, progress)
     capture, rows, eval_every = _read_capture(folder, split, settings, data_format)
@@ -102,7 +104,7 @@ def list_frames(folder: Path, split: Split, settings: DataSettings = DataSetting
     for what cannot be used."""
     data_format = find_format(folder, settings.data_format)
     if data_format == "blender":
-        return list_blender_frames(folder, split)[0] if split == "train" or has_split(folder, split) else []
+        return list_blender_frames(folder, split)[0] if split == "train" or has_views(folder, split) else []
     capture, rows, _ = _read_capture(folder, split, settings, data_format)
     return [capture.frames[i] for i in rows]
 
@@ -114,8 +116,8 @@ def _read_capture(
     which. With the training split it is said what was left out."""
     capture = READERS[data_format](folder)
     _check_unsplit(settings, has_own_split=capture.splits is not None)
-    if split == "train" and capture.missing:
-        print(capture.missing, file=sys.stderr)
+    for line in capture.left_out if split == "train" else []:
+        print(line, file=sys.stderr)
     every = EVAL_EVERY if settings.eval_every is None else settings.eval_every
     return capture, capture.select(split, every), every if capture.splits is None else None
 

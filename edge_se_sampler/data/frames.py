@@ -36,9 +36,9 @@ MIN_FOCAL, MAX_FOCAL = 0.01, 1e4
 """Focal lengths of cameras, in longer sides of their images: fields of view of 178 degrees, and of 20 arc seconds."""
 MAX_OFFSET = 100.0
 """Of a principal point from the center, in the larger of the image's longer side and the focal length."""
-MAX_POSITION, MAX_REMOVAL = 1e15, 1e5
+MAX_POSITION, MAX_REMOVAL = 1e15, 1e4
 """Coordinates of a camera, world units; and how far all are from the origin, in their distances from each other, beyond
-which numbers of 32 bits cannot tell them apart."""
+which numbers of 32 bits move them by more than a pixel."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,14 @@ def read_headers(files: Sequence[SourceFile]) -> list[ImageHeader]:
         return list(pool.map(read_header, files))
 
 
-def choose_orientation(file: SourceFile, header: ImageHeader, matches: Callable[[ImageHeader], bool]) -> ImageHeader:
+def choose_orientation(
+    file: SourceFile, header: ImageHeader, matches: Callable[[ImageHeader], bool], prefers_stored: bool = False
+) -> ImageHeader:
     """The header of the image as its camera saw it: stored, or upright; what fits the camera's size decides, for
-    programs differ. InputError if both fit and are not the same picture."""
+    programs differ. If both fit and are not the same picture, it is as stored where that is preferred, else
+    InputError."""
     upright, as_stored = header.upright(), replace(header, orientation=1)
-    if header.orientation == 1 or (matches(as_stored) and not matches(upright)):
+    if header.orientation == 1 or (matches(as_stored) and (prefers_stored or not matches(upright))):
         return as_stored
     if matches(upright) and not matches(as_stored) and header.orientation >= 5:
         return upright

@@ -24,7 +24,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.blender import has_split, read_blender, transforms_path
+from edge_se_sampler.data.blender import has_views, read_blender, transforms_path
 from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
@@ -143,7 +143,7 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
     written: dict[str, tuple[str, str]] = {}
     cut_off: list[tuple[JsonValue, int]] = []
     needed = np.zeros(2)  # padding, over all views
-    found: tuple[Split, ...] = tuple(split for split in SPLITS if has_split(data, split))
+    found: tuple[Split, ...] = tuple(split for split in SPLITS if has_views(data, split))
     for split in found or SPLITS[:1]:  # where there is none, the loader says so
         views = read_blender(data, split)
         top = read_json(transforms_path(data, split))

@@ -7,7 +7,8 @@ import math
 import os
 import reprlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,13 @@ class JsonValue:
             return float(self.value)
         except OverflowError:
             raise self._expected("a finite number", "write a number that fits a double") from None
+
+    def unquoted(self) -> JsonValue:
+        """The finite number that a text is; what is none stays as it is."""
+        with suppress(ValueError):
+            if isinstance(self.value, str) and math.isfinite(number := float(self.value)):
+                return replace(self, value=number)
+        return self
 
     def positive_number(self) -> float:
         if (number := self.number()) <= 0:

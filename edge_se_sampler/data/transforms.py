@@ -30,15 +30,15 @@ def read_transforms(folder: Path) -> Capture:
             raise value.location.error("is of a camera that is not supported", "make perspective images of it")
     listed = read_entries(top, folder)
     splits = _read_splits(top, listed)
-    entries, missing = keep_existing(listed, [entry.image for entry in listed], top.required("frames", "").location)
+    entries, left_out = keep_existing(listed, [entry.image for entry in listed], top.required("frames", "").location)
     entries.sort(key=lambda entry: entry.file_path)
     if splits is None:
-        return Capture(read_frames(entries), missing)
+        return Capture(read_frames(entries), left_out)
     keys = [_key(entry.file_path) for entry in entries]
     rows: dict[Split, list[int]] = {}
     for split, names in splits.items():
         rows[split] = [i for i, key in enumerate(keys) if key in names]
-    return Capture(read_frames(entries), missing, rows)
+    return Capture(read_frames(entries), left_out, rows)
 
 
 def _key(path: str) -> str:
@@ -57,6 +57,8 @@ def _read_splits(top: JsonValue, entries: list[Entry]) -> dict[Split, set[str]] 
         value = top.optional(f"{split}_filenames")
         for name in [] if value is None else value.list():
             key = _key(name.file_path())
+            if key not in known:
+                key = _key(name.file_path().replace("\\", "/"))  # written on Windows
             if key not in known:
                 key = by_stem.get(os.path.splitext(key)[0], key)
             if key not in known:

@@ -23,6 +23,7 @@ from edge_se_sampler.data.scene_file import (
     quote,
 )
 
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 # of the image and its camera, in pixels but for angles: for one frame, or at the top of the file for all frames
 _INTRINSICS = {
     "w": JsonValue.count,
@@ -33,7 +34,7 @@ _INTRINSICS = {
     "fl_y": JsonValue.positive_number,
     "camera_angle_x": lambda value: _read_half_tan(value),
     "camera_angle_y": lambda value: _read_half_tan(value),
-    **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), JsonValue.number),
+    **dict.fromkeys(_DISTORTION, JsonValue.number),
     "camera_model": lambda value: _read_model(value),
     "is_fisheye": lambda value: _read_flag(value),
 }
@@ -107,7 +108,7 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
     image = _locate(file_path, folder)
     return Entry(
         location=entry.location,
-        file_path=file_path.file_path(),
+        file_path=_read_path(file_path, folder),
         image=image,
         mask=find_mask(folder, image) if mask_path is None else _locate(mask_path, folder),
         pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),
@@ -117,6 +118,8 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
 
 def _read_intrinsics(parent: JsonValue) -> dict[str, JsonValue]:
     stated = {key: value for key in _INTRINSICS if (value := parent.optional(key))}
+    for key in stated.keys() & _DISTORTION:  # which nerfstudio writes in quotes for RealityCapture's cameras
+        stated[key] = stated[key].unquoted()
     for key, value in stated.items():
         _INTRINSICS[key](value)
     return stated
@@ -167,10 +170,16 @@ def rigid_pose(matrix: JsonValue, entries: Sequence[JsonValue]) -> np.ndarray:
     return pose[:3]
 
 
+def _read_path(name: JsonValue, folder: Path) -> str:
+    """The path that `name` holds, which may have been written on Windows."""
+    path = name.file_path()
+    return path if os.path.exists(folder / listed_file(path)) else path.replace("\\", "/")
+
+
 def _locate(name: JsonValue, folder: Path) -> SourceFile:
     """The file that `name` means; without .png, .jpg or .jpeg, the first of these that exists, else one of
     exactly that name, which may be of another kind, else the first."""
-    path = name.file_path()
+    path = _read_path(name, folder)
     listed = listed_file(path)
     if path != listed:
         others = (*(path + suffix for lower in _SUFFIXES for suffix in (lower, lower.upper())), path)

@@ -10,8 +10,8 @@ import numpy as np
 
 from edge_se_sampler.data.cameras import Cameras
 
-NERF_SYNTHETIC_DEPTHS = (2.0, 6.0)
-"""Between them lie NeRF's Blender scenes, world units."""
+NERF_SYNTHETIC_DEPTHS, NERF_SYNTHETIC_DISTANCES = (2.0, 6.0), (3.5, 4.5)
+"""Between them lie NeRF's Blender scenes, and how far their cameras are from the origin, world units."""
 
 
 @dataclass(frozen=True)
