@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Demo:
-    """Train Random, Edge + SE and lean-nerf on an off-center, mostly white scene, and compare them: three minutes."""
+    """Train Random, Edge + SE and lean-nerf on an off-center, mostly white scene, in two to three minutes."""
 
     output_dir: Path = Path()
     """Folder for demo.html, demo.png, demo.gif, demo.json and demo/ (the scene and the runs)."""
