@@ -41,7 +41,7 @@ def read_llff(folder: Path) -> Capture:
     items = zip(files, read_headers(files), rows, strict=True)
     frames = [_frame(folder, file, header, row) for file, header, row in items]
     points = [_points(frame.pose, row[15:]) for frame, row in zip(frames, rows, strict=True)]
-    return Capture(frames, "", points=points)
+    return Capture(frames, [], points=points)
 
 
 def _read_rows(path: Path) -> np.ndarray:
