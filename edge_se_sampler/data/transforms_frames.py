@@ -105,12 +105,15 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
     own = _read_intrinsics(entry)
     # an angle of the frame's own says more than a focal length of the file's
     shared = {key: value for key, value in shared.items() if key.replace("fl_", "camera_angle_") not in own}
-    image = _locate(file_path, folder)
+    path = _read_path(file_path, folder)
+    image = _locate(path, folder, file_path.location)
     return Entry(
         location=entry.location,
-        file_path=_read_path(file_path, folder),
+        file_path=path,
         image=image,
-        mask=find_mask(folder, image) if mask_path is None else _locate(mask_path, folder),
+        mask=find_mask(folder, image)
+        if mask_path is None
+        else _locate(_read_path(mask_path, folder), folder, mask_path.location),
         pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),
         intrinsics=shared | own,
     )
@@ -176,15 +179,14 @@ def _read_path(name: JsonValue, folder: Path) -> str:
     return path if os.path.exists(folder / listed_file(path)) else path.replace("\\", "/")
 
 
-def _locate(name: JsonValue, folder: Path) -> SourceFile:
-    """The file that `name` means; without .png, .jpg or .jpeg, the first of these that exists, else one of
+def _locate(path: str, folder: Path, location: SourceLocation) -> SourceFile:
+    """The file that a listed path means; without .png, .jpg or .jpeg, the first of these that exists, else one of
     exactly that name, which may be of another kind, else the first."""
-    path = _read_path(name, folder)
     listed = listed_file(path)
     if path != listed:
         others = (*(path + suffix for lower in _SUFFIXES for suffix in (lower, lower.upper())), path)
         listed = next((other for other in others if os.path.isfile(folder / other)), listed)
-    return locate_file(folder, listed, name.location)
+    return locate_file(folder, listed, location)
 
 
 def _check_size(entry: Entry, header: ImageHeader, first: ImageHeader, key: str, axis: str) -> None:
