@@ -69,6 +69,17 @@ def test_pixels_are_drawn_in_proportion_to_their_cells_value(
     np.testing.assert_allclose((ratio * uniform), p, rtol=1e-5)
 
 
+@pytest.mark.parametrize("across_images", [False, True])
+def test_images_without_a_valid_pixel_count_in_no_ratio(across_images: bool) -> None:
+    masks = half_masks(SAME)
+    masks[1] = torch.zeros_like(masks[1])
+    table, indices = random_table(ImageBatch.of(batch_of(SAME, masks=masks), use_mask=True), 4, across_images=across_images)
+    valid = torch.cat([torch.nonzero(mask[None]) + torch.tensor([k, 0, 0]) for k, mask in enumerate(masks)])
+    support = torch.tensor([mask.sum() for mask in masks])[valid[:, 0]]
+    uniform = 1 / (2 * support.double())
+    assert float((table.density_ratio(indices, valid) * uniform).sum()) == pytest.approx(1)
+
+
 def test_changed_values_are_drawn_from_and_kept_bit_for_bit() -> None:
     batch = images(MIXED, masked=True)
     table, indices = random_table(batch, 100)

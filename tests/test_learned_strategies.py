@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,12 @@ def trained(
     return sampler, pixels
 
 
+def saved_bytes(sampler: EdgeSEPixelSampler) -> bytes:
+    file = io.BytesIO()
+    torch.save(sampler.state_dict(), file)
+    return file.getvalue()
+
+
 def drawn_uniformly(batch: ImageBatch, count: int, seed: int) -> PixelBatch:
     return Uniform(settings()).draw(batch, count, TrainingStep(seed=seed))
 
@@ -112,11 +119,8 @@ def test_a_resumed_sampler_draws_the_same_bit_for_bit(name: str, images_per_step
     batch = batch_of(MIXED, masks=half_masks(MIXED))
     for steps in (0, 1, 4, 9):
         sampler, _ = trained(name, steps, batch, images_per_step=images_per_step)
-        file = io.BytesIO()
-        torch.save(sampler.state_dict(), file)
-        file.seek(0)
         resumed = following(LATE + steps, early="uniform", late=name, images_per_step=images_per_step)
-        resumed.load_state_dict(torch.load(file, weights_only=True))
+        resumed.load_state_dict(torch.load(io.BytesIO(saved_bytes(sampler)), weights_only=True))
         for _ in range(5):
             (_, went_on), (_, again) = trained(name, 1, batch, sampler), trained(name, 1, batch, resumed)
             assert all(torch.equal(went_on[key], again[key]) for key in went_on)
@@ -276,6 +280,24 @@ def test_errors_are_divided_by_the_density_of_the_pixels() -> None:
     assert np.abs(np.array(after) / before - 1).mean() < 0.05
 
 
+@pytest.mark.parametrize("name", [*LEARNED, "regions", "quadtree", "se"])
+def test_a_step_whose_errors_are_not_finite_teaches_nothing(name: str) -> None:
+    batch = batch_of(SAME)
+    changes = {"error_source": "cached"} if name == "se" else {}
+    sampler, _ = trained(name, 4, batch, **changes)
+    before = saved_bytes(sampler)
+    pixels = sampler.sample(batch)
+    between = saved_bytes(sampler)  # walkers have moved
+    assert name in WALKS or between == before
+    errors = errors_of(pixels)
+    errors[5] = torch.nan
+    sampler.observe(errors)
+    assert saved_bytes(sampler) == between
+    sampler.sample(batch)
+    sampler.observe(errors_of(pixels))
+    assert saved_bytes(sampler) != between
+
+
 # ---- Soft Mining
 
 
@@ -304,7 +326,8 @@ def test_walkers_drift_along_the_gradient_of_the_logarithm_and_diffuse(monkeypat
 def test_the_gradient_is_the_central_difference_between_known_cells() -> None:
     strategy, _ = walking()
     rng = np.random.default_rng(1)
-    strategy.map = np.where(rng.random(2 * 64 * 64) < 0.8, rng.random(2 * 64 * 64), 0)
+    # unknown, without an error, and others
+    strategy.map = rng.choice([0, 1e-20, 1], p=[0.2, 0.2, 0.6], size=2 * 64 * 64) * rng.random(2 * 64 * 64)
     image, x = rng.integers(2, size=300), rng.random((300, 2))
     got = strategy._gradient(image, x)
     for i, (k, (y, z)) in enumerate(zip(image, x, strict=True)):
@@ -314,7 +337,8 @@ def test_the_gradient_is_the_central_difference_between_known_cells() -> None:
             [((max(r - 1, 0), c), (min(r + 1, 63), c)), ((r, max(c - 1, 0)), (r, min(c + 1, 63)))]
         ):
             known = q[low] > 0 and q[high] > 0
-            expected = (np.log(q[high]) - np.log(q[low])) / ((high[axis] - low[axis]) / 64) if known else 0
+            before, after = (math.log(max(q[cell], 2**-10)) for cell in (low, high))
+            expected = (after - before) / ((high[axis] - low[axis]) / 64) if known else 0
             assert got[i, axis] == pytest.approx(expected)
 
 
@@ -327,8 +351,8 @@ def test_the_worst_walkers_and_those_that_left_are_restarted_from_edges_and_a_te
     jumped = np.abs(moved[:, 1:3] - 0.5).max(axis=1) > 6 * 0.02
     assert jumped[:101].mean() > 0.8
     assert jumped[200:300].mean() > 0.8
-    rest = np.delete(jumped, np.r_[:101, 200:300])
-    assert 0.05 < rest.mean() < 0.12
+    assert jumped[900:].mean() > 0.8  # always the last ones: all others walk on
+    assert not np.delete(jumped, np.r_[:101, 200:300, 900:1000]).any()
 
 
 @pytest.mark.parametrize("restarted", [False, True])

@@ -176,7 +176,7 @@ def test_open_leaves_with_large_errors_are_subdivided_when_enough_is_known(monke
     forest.add([7, 3])
     rows = columns = trees = np.zeros(0, dtype=np.int64)
     squared = np.zeros(0)
-    judged = []
+    judged, unseen = [], 0
     for step in range(200):
         n = 50
         cells = rng.integers(0, 2, n), rng.integers(0, SIDE, n), rng.integers(0, SIDE, n)
@@ -195,13 +195,15 @@ def test_open_leaves_with_large_errors_are_subdivided_when_enough_is_known(monke
         for tree, row, column in np.argwhere(np.ones(corners.shape)).tolist():
             inside = (trees == tree) & (rows // side == row) & (columns // side == column)
             found = squared[inside]
-            grows = corners[tree, row, column] and len(found) and math.sqrt(found.mean() / 3) > threshold
+            is_large = not len(found) or math.sqrt(found.mean() / 3) > threshold  # what nobody looked at stays open
+            grows, unseen = corners[tree, row, column] and is_large, unseen + (not len(found))
             block = np.s_[tree, row * side : (row + 1) * side, column * side : (column + 1) * side]
             assert np.array_equal(forest.level[block], np.full((side, side), deepest + 1) if grows else before[block])
         rows = columns = trees = np.zeros(0, dtype=np.int64)
         squared = np.zeros(0)
         judged.append(deepest)
     assert judged == [2, 3, 4]
+    assert unseen
     assert set(np.unique(forest.level)) == {2, 3, 4, 5}
 
 

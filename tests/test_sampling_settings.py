@@ -72,6 +72,7 @@ def test_values_at_their_limits_are_accepted(settings: dict[str, Any]) -> None:
         ({"early": "auto"}, True, "uniform", "fraction"),
         ({"early": "auto"}, False, "edge", "adaptive"),
         ({"early": "auto", "schedule": "adaptive"}, True, "edge", "adaptive"),
+        ({"early": "auto", "schedule": "steps", "early_steps": 9}, False, "edge", "steps"),
         ({"early": "precrop"}, True, "precrop", "fraction"),
         ({"early": "uniform"}, False, "uniform", "fraction"),
     ],

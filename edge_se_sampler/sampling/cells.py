@@ -194,9 +194,9 @@ class CellTable:
     def density_ratio(self, images: Tensor, drawn: Tensor) -> Tensor:
         """(n,) float64 p of drawn pixels over that under uniform sampling, image first, pixel second."""
         indices, which = images.numpy(), drawn[:, 0].numpy()
-        mass = self._image_mass[indices]
-        per_image = np.full(len(mass), mass.sum() / len(mass)) if self.across_images else mass
-        scale = self._support[indices] / np.maximum(per_image, MIN_VALUE)
+        mass, support = self._image_mass[indices], self._support[indices]
+        mean = mass.sum() / max(1, np.count_nonzero(support))  # over the images that uniform sampling chooses from
+        scale = support / np.maximum(mean if self.across_images else mass, MIN_VALUE)
         return torch.from_numpy(self.values[self.cells_at(images, drawn)] * scale[which])
 
     def state_dict(self) -> dict[str, Any]:

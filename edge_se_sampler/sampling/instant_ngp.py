@@ -8,7 +8,8 @@ P(y)   0.99 x a row's share of its image's m + 0.01 / rows
 P(x|y) 0.99 x a cell's share of its row's m + 0.01 / columns
 
 Half of the pixels are uniform, half are drawn from P(y) P(x|y); before the first rebuild all are uniform. The loss is
-not weighted, as the code's comment wants it. Decided here: m is divided by the density of both halves together, where
+not weighted, as the code's comment wants it. Pixels of a cell that is masked in part are drawn less often, as in the
+code: m is a sum over its valid pixels alone. Decided here: m is divided by the density of both halves together, where
 the code takes 1 for the uniform one; images are drawn alike, the code's default; S is at most the image's side in rows
 and in columns, each by itself.
 """

@@ -180,8 +180,10 @@ class ImportantPixels:
         return errors
 
     def _update(self, drawn: PixelBatch, squared_error: Tensor) -> None:
-        for part in self.parts().values():
-            if part.needs_errors:
+        parts = [part for part in self.parts().values() if part.needs_errors]
+        # what is not finite would never be forgotten; with mixed precision, nerfstudio skips such a step, too
+        if parts and bool(squared_error.isfinite().all()):
+            for part in parts:
                 part.update(drawn, squared_error.detach(), self._step)
 
 

@@ -8,8 +8,9 @@ c        color change around a pixel, at least CHANGE_FLOOR times its mean over 
 
 A leaf is drawn by its weight; half of its pixels are drawn uniformly, half in proportion to c, as in its code. Decided
 here: a level is judged as soon as PIXELS_PER_LEAF pixels were drawn, on average, for each of its open leaves, where the
-paper waits for epochs, which short trainings have none of; by the root mean squared error of a channel (the paper: an
-average error; its code: the largest); and trees stay to the end, where the paper's last epoch takes all pixels.
+paper waits for epochs, which short trainings have none of, and a leaf that nobody has looked at stays open; by the
+root mean squared error of a channel (the paper: an average error; its code: the largest); and trees stay to the end,
+where the paper's last epoch takes all pixels.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ class Forest:
             return False
         by_leaf = (len(self.level), SIDE // side, side, SIDE // side, side)
         error, count = (values.reshape(by_leaf).sum(axis=(2, 4)) for values in (self.error, self.count))
-        grown = open_leaves & (error > 3 * threshold**2 * count)
+        grown = open_leaves & ((error > 3 * threshold**2 * count) | (count == 0))
         self.deepest += 1
         self.level[grown.repeat(side, axis=1).repeat(side, axis=2)] = self.deepest
         self.error[:], self.count[:] = 0, 0

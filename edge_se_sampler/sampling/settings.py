@@ -28,8 +28,8 @@ class SamplingSettings:
 
     early: EarlyStrategy = "edge"
     """How pixels are drawn in the early phase: uniformly, from the center of the image, in proportion to edge
-    strength, or as the errors tell that training found (see sampling/README.md); auto: uniformly where alpha tells
-    where the object is, otherwise by edges under the adaptive schedule."""
+    strength, or as the errors tell that training found (see sampling/README.md); auto: uniformly where lean-nerf knows
+    from alpha where the object is, otherwise by edges, under the adaptive schedule unless that is steps."""
     late: LateStrategy = "se"
     """How pixels are drawn afterwards: uniformly, by the rank of their squared error among uniform candidates, or as
     the errors tell that training found. The same name as early's: all the time."""
@@ -76,7 +76,7 @@ class SamplingSettings:
             return self
         if has_masks and self.schedule != "adaptive":
             return replace(self, early="uniform")
-        return replace(self, early="edge", schedule="adaptive")
+        return replace(self, early="edge", schedule="steps" if self.schedule == "steps" else "adaptive")
 
     def rules(self) -> list[tuple[str, bool, str]]:
         """Field, whether its value has a meaning, and what is wrong if not."""

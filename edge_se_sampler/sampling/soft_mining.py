@@ -1,17 +1,19 @@
 """Soft Mining (Kheradmand et al. 2024, "Accelerating Neural Field Training via Soft Mining", arXiv 2312.00075; code:
 github.com/ubc-vision/nf-soft-mining, examples/datasets/lmc.py and train_ngp_nerf_prop.py).
 
-q   error at a pixel, which its density shall be proportional to: the root of the mean squared error of the channels
+q   error at a pixel, which its density shall be proportional to
 x   a walker's position as a share of its image's rows and columns
 
 A step's pixels are those that walkers stand on. First they move, by Langevin's step: x += b^2/2 grad(log q) + b N(0, 1)
-with b = 0.02. Then a tenth is drawn anew uniformly; the tenth with the smallest errors, and who left the image, from
-Sobel edges. The loss is weighted by q^-r, but at most by the weights' mean + standard deviation; r = min(step / 1000,
-alpha).
+with b = 0.02. Then a tenth, always the same walkers, is drawn anew uniformly; the tenth with the smallest errors, and who
+left the image, from Sobel edges. The loss is weighted by q^-r, but at most by the weights' mean + standard deviation;
+r = min(step / 1000, alpha), alpha being `soft_mining_alpha`.
 
-Decided here, for a sampler sees errors and no gradients: grad(log q) is the central difference in a map, 64 x 64 cells
-an image, each the mean of its previous value and of the q found last; the code has the gradient of a pixel's own loss,
-times 20 and over the number of rays in place of b^2/2. Weights are by the map's q before the step, over its mean.
+Decided here, for a sampler sees errors and no gradients: q is the root of the mean squared error of the channels (the
+code weights by the mean absolute one); grad(log q) is the central difference in a map, 64 x 64 cells an image, each the
+mean of its previous value and of the q found last, no less than MIN_ERROR; the code has the gradient of a pixel's own
+loss, times 20 and over the number of rays in place of b^2/2. Weights are by the map's q before the step, over the mean
+of the step's pixels.
 A walker that is drawn anew may get another of the batch's images (the code leaves it its own), so that images with
 larger errors have more of them; with one image a step, each image has its own walkers. Who comes onto a masked pixel
 has left the image. A process of a distributed run has its own walkers. p/u is the density aimed at, not the walk's: a
@@ -37,7 +39,7 @@ from edge_se_sampler.sampling.strategies import Edge
 
 SIDE, NOISE, SHARE, WARMUP_STEPS, EDGE_FLOOR = 64, 0.02, 0.1, 1000, 1e-5
 MIN_ERROR = 2.0**-10
-"""Of the weights' q: the smallest step of a half-precision number at 1."""
+"""The least q of gradients and weights: the smallest step of a half-precision number at 1."""
 
 
 class SoftMining(LearnedDistribution):
@@ -100,7 +102,7 @@ class SoftMining(LearnedDistribution):
         x = x + NOISE**2 / 2 * self._gradient(image, x) + NOISE * rng.standard_normal(x.shape)
         left = ~((x >= 0) & (x < 1)).all(axis=1) | ~cells.valid(image, cells.pixel_at(image, x))
         restarted = (left | (walkers[:, 3] <= np.partition(walkers[:, 3], anew)[anew])) & ~new
-        uniform = new | (rng.permutation(count) < anew) & ~restarted
+        uniform = new | (np.arange(count) >= count - anew) & ~restarted
         moved = np.column_stack((image, x, walkers[:, 3]))
         edges, edge_index = self.edges.tables(batch)
         for rows, source, index in (uniform, cells, torch.from_numpy(images)), (restarted, edges, edge_index[drawable]):
@@ -119,6 +121,7 @@ class SoftMining(LearnedDistribution):
             low[:, axis], high[:, axis] = np.maximum(at[:, axis] - 1, 0), np.minimum(at[:, axis] + 1, grid[:, axis] - 1)
             before, after = (self.map[cells.first[image] + c[:, 0] * grid[:, 1] + c[:, 1]] for c in (low, high))
             known = (before > 0) & (after > 0)
+            before, after = np.maximum(before, MIN_ERROR), np.maximum(after, MIN_ERROR)
             distance = (high - low)[known, axis] / grid[known, axis]  # 0 where there is one cell, and no difference
             gradient[known, axis] = np.log(after[known] / before[known]) / np.maximum(distance, 1e-9)
         return gradient
