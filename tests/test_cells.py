@@ -73,7 +73,9 @@ def test_pixels_are_drawn_in_proportion_to_their_cells_value(
 def test_images_without_a_valid_pixel_count_in_no_ratio(across_images: bool) -> None:
     masks = half_masks(SAME)
     masks[1] = torch.zeros_like(masks[1])
-    table, indices = random_table(ImageBatch.of(batch_of(SAME, masks=masks), use_mask=True), 4, across_images=across_images)
+    table, indices = random_table(
+        ImageBatch.of(batch_of(SAME, masks=masks), use_mask=True), 4, across_images=across_images
+    )
     valid = torch.cat([torch.nonzero(mask[None]) + torch.tensor([k, 0, 0]) for k, mask in enumerate(masks)])
     support = torch.tensor([mask.sum() for mask in masks])[valid[:, 0]]
     uniform = 1 / (2 * support.double())
