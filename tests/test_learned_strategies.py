@@ -283,7 +283,7 @@ def test_errors_are_divided_by_the_density_of_the_pixels() -> None:
 @pytest.mark.parametrize("name", [*LEARNED, "regions", "quadtree", "se"])
 def test_a_step_whose_errors_are_not_finite_teaches_nothing(name: str) -> None:
     batch = batch_of(SAME)
-    changes = {"error_source": "cached"} if name == "se" else {}
+    changes: dict[str, Any] = {"error_source": "cached"} if name == "se" else {}
     sampler, _ = trained(name, 4, batch, **changes)
     before = saved_bytes(sampler)
     pixels = sampler.sample(batch)
