@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
@@ -57,7 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _exit(message: str, code: int) -> NoReturn:
-    print(f"edge-se: {message}", file=sys.stderr, flush=True)
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)  # names may have line ends in them
+    with contextlib.suppress(OSError):  # of a log whose disk is full: the exit code tells, too
+        print(f"edge-se: {line}", file=sys.stderr, flush=True)
     if ranks.world_size() > 1:  # torch's threads, waiting for a rank that is gone, may abort a normal end
         os._exit(code)
     sys.exit(code)

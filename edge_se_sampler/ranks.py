@@ -39,7 +39,10 @@ def join(device: str) -> None:
     """Meet the other processes that torchrun has started, if it has; `device` is "cuda", "mps" or "cpu". InputError:
     there is no GPU for this one."""
     global _rank, _world_size
-    world = int(os.environ.get("WORLD_SIZE", 1))
+    world = os.environ.get("WORLD_SIZE", "1")
+    if not world.isdecimal():
+        raise InputError(f"WORLD_SIZE is {world!r} in the environment: torchrun sets it to a number; unset it")
+    world = int(world)
     if world == _world_size or not {"RANK", "MASTER_ADDR"} <= os.environ.keys():
         return
     import torch

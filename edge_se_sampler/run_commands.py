@@ -175,6 +175,7 @@ def load_run(folder: Path) -> tuple[RunFolder, TrainerConfig]:
 
 def train(trainer: Any) -> None:
     """Train, and say where the result is. Exits with 130 if it was stopped by Ctrl-C."""
+    from edge_se_sampler.engine.progress import write_line
     from edge_se_sampler.engine.session import describe_run
 
     if is_main():
@@ -183,11 +184,11 @@ def train(trainer: Any) -> None:
     if not is_main():
         sys.exit(130 if trainer.stop_requested else 0)
     resume = f"edge-se resume {quote(str(trainer.run.path))}"
-    if trainer.stop_requested:
-        print(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}", file=sys.stderr)
+    stopping, has_ended = trainer.early_stopping, trainer.next_step == trainer.plan.num_steps
+    if trainer.stop_requested and not has_ended:
+        write_line(f"edge-se: stopped after {trainer.next_step} iterations and saved; continue: {resume}")
         sys.exit(130)
     print(f"{trainer.next_step} of {trainer.plan.num_steps or '?'} iterations in {trainer.elapsed:.1f} s of training")
-    stopping, has_ended = trainer.early_stopping, trainer.next_step == trainer.plan.num_steps
     if stopping.is_due and not has_ended:
         print(f"stopped: no gain of {stopping.min_gain:g} dB in the last {stopping.patience} previews")
     print(f"measure it: edge-se eval {quote(str(trainer.run.path))}")

@@ -116,6 +116,7 @@ SETTINGS = [
     (["--pipeline.datamanager.pixel-sampler.early-steps", "9"], "schedule"),
     (["--pipeline.datamanager.pixel-sampler.edge-epsilon", "0"], "edge-epsilon"),
     (["--max-num-iterations", "0"], "--max-num-iterations"),
+    (["--machine.seed", str(2**63)], "--machine.seed"),
     (["--max-seconds", "nan"], "--max-seconds"),
     (["--max-seconds", "inf"], "--max-seconds"),
     (["--optimizer.lr", "-1"], "--optimizer.lr"),
@@ -190,6 +191,7 @@ class TestRuns:
         for command in ("eval", "render", "resume"):
             assert "no such run folder" in refused(edge_se, tmp_path, command, tmp_path / "nowhere")
             assert "config.json" in refused(edge_se, tmp_path, command, tmp_path)
+            assert r"no\nsuch\x1b[31m run: " in refused(edge_se, tmp_path, command, "no\nsuch\x1b[31m run")
 
     def test_without_checkpoint(self, run: Path, edge_se):
         next((run / "checkpoints").iterdir()).unlink()
@@ -203,6 +205,19 @@ class TestRuns:
         path.write_bytes(content)
         for command in ("eval", "resume", "render"):
             assert path.name in refused(edge_se, run, command, run)
+
+    def test_with_a_checkpoint_elsewhere(self, run: Path, tmp_path: Path, edge_se):
+        path = next((run / "checkpoints").iterdir())
+        path.rename(tmp_path / path.name)
+        path.symlink_to(tmp_path / path.name)
+        for command in ("eval", "resume"):
+            assert "leads out of the folder" in refused(edge_se, run, command, run)
+
+    def test_that_cannot_be_extended(self, run: Path, edge_se):
+        assert "63 bits" in refused(edge_se, run, "resume", run, "--max-num-iterations", 10**20)
+        shutil.rmtree(run / "previews")
+        (run / "previews").touch()
+        assert "previews: cannot be created" in refused(edge_se, run, "resume", run, "--max-num-iterations", "50")
 
     def test_with_another_configuration(self, run: Path, edge_se):
         config = json.loads((run / "config.json").read_text())

@@ -265,3 +265,14 @@ def test_a_disk_that_fills_under_tensorboard_is_one_error(tmp_path: Path, monkey
     with pytest.raises(InputError, match="No space left"):
         events.write({"step": 2, "loss": 1.0})
     assert printed == []
+
+
+def test_a_folder_whose_name_is_no_text_has_no_events(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"s\xff")
+    (events := EventWriter(folder)).write({"step": 0, "loss": 1.0})
+    events.close()
+    assert not folder.exists()
+    pytest.importorskip("tensorboard")
+    (events := EventWriter(tmp_path / "s")).write({"step": 0, "loss": 1.0})
+    events.close()
+    assert (tmp_path / "s").exists()

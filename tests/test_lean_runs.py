@@ -199,6 +199,7 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
     flags = ["train", "lean-nerf", "--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "3"]
     for flag, value, word in (
         ("--pipeline.model.voxel-size-px", "0", "voxel-size-px is 0.0"),
+        ("--pipeline.model.voxel-size-px", "1e-300", "at least 0.01"),
         ("--pipeline.model.step-size-voxels", "nan", "step-size-voxels is nan"),
         ("--pipeline.model.step-size-voxels", "1e-6", "at least 0.05"),
         ("--pipeline.model.voxel-size-px", "1e300", "at most 1000"),

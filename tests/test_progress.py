@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import sys
 
 import pytest
 
-from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.progress import Progress, write_line
 
 
 class Clock:
@@ -23,6 +24,22 @@ class Clock:
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
+
+
+class Full(io.StringIO):
+    """A log on a full disk."""
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+class GoneTerminal(Terminal):
+    """One that is closed after the bar's first drawing."""
+
+    def write(self, text: str) -> int:
+        if self.getvalue():
+            raise OSError(errno.EIO, "Input/output error")
+        return super().write(text)
 
 
 def times_of_lines(seconds_a_step: float, steps: int, capsys: pytest.CaptureFixture[str]) -> list[float]:
@@ -86,3 +103,16 @@ def test_a_terminal_gets_a_bar_that_is_removed(monkeypatch: pytest.MonkeyPatch) 
     assert "loss 0.005" in terminal.getvalue()
     assert "\n" not in terminal.getvalue()
     assert terminal.getvalue().rsplit("\r", 2)[1].strip() == ""
+
+
+@pytest.mark.parametrize("log", [Full, GoneTerminal])
+def test_work_goes_on_without_a_log_that_takes_no_more(log: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", log())
+    clock, done = Clock(), 0
+    with Progress(3, "job", clock=clock) as progress:
+        for step in range(3):
+            clock.now += 40
+            progress.update(step + 1)
+            write_line("a line")
+            done += 1
+    assert done == 3

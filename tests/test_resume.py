@@ -21,8 +21,11 @@ from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.methods import method_configs
+from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackLocation
+from edge_se_sampler.run_commands import train
 from edge_se_sampler.sampling import schedule
 
+ONE_STEP = {"max_num_iterations": 1, "pipeline.model": tiny_config()}
 SESSION = """
 import hashlib, json, os, signal, sys
 from dataclasses import replace
@@ -156,16 +159,20 @@ def test_a_checkpoint_keeps_the_adaptive_schedules_state(
     assert train(resume_trainer(trainer, views), later) == went_on
 
 
-def test_ctrl_c_saves_a_checkpoint_and_prints_one_line(tmp_path: Path, scene: Path):
+@pytest.mark.skipif(os.name == "nt", reason="its processes get no signals")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
+def test_ctrl_c_and_a_closed_terminal_save_a_checkpoint_and_print_one_line(name: str, tmp_path: Path, scene: Path):
+    number = getattr(signal, name)
     command = [
         sys.executable, "-m", "edge_se_sampler.cli", "train", "vanilla-nerf", "--data", str(scene),
         "--output-dir", str(tmp_path / "o"), "--pipeline.datamanager.train-num-rays-per-batch", "16",
     ]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, preexec_fn=lambda: signal.signal(number, signal.SIG_DFL), **pipes)
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob("o/*/*/*/metrics.jsonl")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err.count("\n") == 1
@@ -173,3 +180,14 @@ def test_ctrl_c_saves_a_checkpoint_and_prints_one_line(tmp_path: Path, scene: Pa
     assert "edge-se resume" in err
     run = next(tmp_path.glob("o/*/*/*"))
     assert latest_checkpoint(run / "checkpoints")
+
+
+def test_a_stop_in_the_last_iteration_is_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trainer = tiny_trainer(override(method_configs()["edge-nerf"], ONE_STEP), tiny_views(), tmp_path)
+
+    def stop(step: int) -> None:
+        trainer.stop_requested = True
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], stop))
+    train(trainer)
+    assert "1 of 1 iterations" in capsys.readouterr().out

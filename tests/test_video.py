@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import weakref
 from collections.abc import Iterator
@@ -44,6 +45,28 @@ def test_an_mp4_has_every_frame(tmp_path: Path) -> None:
     assert frames.shape == (7, 32, 32, 3)
     np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)) / 255, np.arange(7) / 6, atol=0.05)
     assert [file.name for file in tmp_path.iterdir()] == ["turn.mp4"]
+
+
+def test_an_mp4_that_ffmpeg_has_not_finished_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where its disk is full: it says so to nobody once it has all frames."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    write_frames = ffmpeg.write_frames
+
+    def write_in_part(name: str, *arguments: Any, **options: Any) -> Iterator[Any]:
+        try:
+            yield from write_frames(name, *arguments, **options)
+        finally:
+            os.truncate(name, path.stat().st_size)
+
+    monkeypatch.setattr(ffmpeg, "write_frames", write_in_part)
+    path = tmp_path / "turn.mp4"
+    for before in (b"", b"1" * 1000):
+        path.write_bytes(before)
+        with pytest.raises(InputError, match=r"turn\.mp4: cannot be written, .*ffmpeg") as refusal:
+            write_video(path, shades(32, 32), 10)
+        assert "\n" not in str(refusal.value)
+        assert path.read_bytes() == before
+        assert list(tmp_path.iterdir()) == [path]
 
 
 def test_without_the_video_extra_an_mp4_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 import torch
 
-from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
+from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, locate_file
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.engine.saved_state import check_archive, check_tensors
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
@@ -107,6 +107,7 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle, is none, or
     was saved under another configuration."""
     try:
+        locate_file(path.parent, path.name, SourceLocation(path.parent))
         content = SourceFile(path, SourceLocation(path)).read_bytes()
     except InputError as problem:
         raise DamagedCheckpoint(str(problem)) from problem

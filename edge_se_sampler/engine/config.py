@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -22,6 +22,9 @@ from edge_se_sampler.models.config import (
     SizePreset,
 )
 from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
+
+MAX_INTEGER = 2**63
+"""Integers of a config are less, and more than its negative: torch knows no others."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +153,7 @@ class TrainerConfig(InstantiateConfig):
             "steps-per-log": self.steps_per_log,
             "pipeline.datamanager.train-num-rays-per-batch": manager.train_num_rays_per_batch,
         }
+        _check_integers(self)
         for flag, value in at_least_one.items():
             check_value(flag, value, value is None or value >= 1, "at least 1")
         rays = self.preset.rays
@@ -189,6 +193,16 @@ class TrainerConfig(InstantiateConfig):
             raise InputError("--max-num-iterations and --time-budget or --segments: give one of them")
         valid = self.segments is None or (len(self.segments) == 100 and min(self.segments) >= 0 < sum(self.segments))
         check_value("segments", self.segments, valid, "100 numbers of iterations, not all of them 0")
+
+
+def _check_integers(config: Any, prefix: str = "") -> None:
+    """InputError for an integer that a run's config.json could not hold, which would be read as none."""
+    for name in (setting.name for setting in fields(config)):
+        value, flag = getattr(config, name), prefix + name.replace("_", "-")
+        if is_dataclass(value):
+            _check_integers(value, f"{flag}.")
+        elif isinstance(value, int):
+            check_value(flag, value, abs(value) < MAX_INTEGER, "an integer of at most 63 bits")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from typing import Any
 
 from tqdm import tqdm
@@ -28,6 +28,10 @@ class Progress(AbstractContextManager):
         self._began = self._last_line = self._last_update = clock()
 
     def update(self, done: int, total: int | None = None, note: str = "") -> None:
+        with suppress(OSError):  # nobody reads it any more, or its disk is full: no reason to stop the work
+            self._update(done, total, note)
+
+    def _update(self, done: int, total: int | None, note: str) -> None:
         self.total = self.total if total is None else total
         if not self._bar.disable:
             self._bar.total = self.total
@@ -43,7 +47,14 @@ class Progress(AbstractContextManager):
 
     def close(self) -> None:
         """Remove the bar."""
-        self._bar.close()
+        with suppress(OSError):
+            self._bar.close()
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+
+def write_line(line: str) -> None:
+    """Print a line to stderr, above a bar if there is one."""
+    with suppress(OSError):
+        tqdm.write(line, file=sys.stderr)

@@ -20,7 +20,7 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, locate_file, quote, read_json
-from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.engine.config import MAX_INTEGER, TrainerConfig
 from edge_se_sampler.engine.files import checksum, write_atomically, write_json
 from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
@@ -113,7 +113,7 @@ class RunFolder:
                 if not isinstance(line["step"], int) or not is_checked:
                     raise ValueError(f"the line of step {line['step']} is not as it was written")
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as problem:
-            raise InputError(f"{path}: damaged ({quote(problem)}); mend or remove it") from problem
+            raise InputError(f"{path}: damaged ({quote(str(problem))}); mend or remove it") from problem
         if rest:
             print(f"edge-se: {path}: its last line was cut short and is left out", file=sys.stderr)
         return lines
@@ -125,13 +125,16 @@ class RunFolder:
 
 
 class EventWriter:
-    """Writes the numbers of metrics.jsonl's lines as TensorBoard's scalars; without the extra it does nothing."""
+    """Writes the numbers of metrics.jsonl's lines as TensorBoard's scalars; nothing without the extra, nor in a folder
+    whose name is no text."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._writer = folder, None
+        is_text = os.fsencode(folder).decode(errors="replace") == str(folder)  # others TensorBoard cannot name
+        self._can_write = is_text and find_spec("tensorboard") is not None
 
     def write(self, line: dict[str, Any]) -> None:
-        if find_spec("tensorboard") is None:
+        if not self._can_write:
             return
         with os_errors_as_input_errors(f"{self._folder}: TensorBoard's events cannot be written"):
             if self._writer is None:
@@ -235,7 +238,7 @@ def _typed(value: Any, hint: Any) -> Any:
     elif hint is Path and isinstance(value, str) and "\0" not in value:
         return Path(value)
     elif (type(value) is hint or (type(value), hint) == (int, float)) and not (
-        isinstance(value, int) and abs(value) >= 2**63
+        isinstance(value, int) and abs(value) >= MAX_INTEGER
     ):
         return value
     raise ValueError

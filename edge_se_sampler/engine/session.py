@@ -113,11 +113,12 @@ def prepare_resume(
     session_config = replace(config, max_seconds=max_seconds)
     session_config.check()
     _check_run_data(config)
+    if ranks.is_main():
+        make_folder(run.path / "previews", "the run's")  # which git, for one, leaves out when it is empty
     trainer = prepare(session_config, run, saved_grid(state["model"]))
     trainer.resume(state, changed_data)
     if ranks.is_main():
         run.write_config(config)
-        make_folder(run.path / "previews", "RUN")  # which git, for one, leaves out when it is empty
     return trainer
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -13,7 +12,6 @@ from typing import Any
 
 import torch
 from torch.optim.lr_scheduler import LambdaLR
-from tqdm import tqdm
 
 from edge_se_sampler import ranks
 from edge_se_sampler.engine.checkpoint import save_checkpoint
@@ -23,7 +21,7 @@ from edge_se_sampler.engine.files import write_image
 from edge_se_sampler.engine.optimizers import create_adam, learning_rate_factor
 from edge_se_sampler.engine.pipeline import Pipeline, load_weights
 from edge_se_sampler.engine.plan import Plan
-from edge_se_sampler.engine.progress import Progress
+from edge_se_sampler.engine.progress import Progress, write_line
 from edge_se_sampler.engine.reinitialization import PROBE_RAYS, DeadNetworkReset
 from edge_se_sampler.engine.rendering import Picture, measure_psnr, render_view
 from edge_se_sampler.engine.run_folder import EventWriter, RunFolder, config_digest
@@ -178,7 +176,7 @@ class Trainer:
         for network, sub_seed in reinitialized.items():
             message = f"step {step}: the {network} network is dead; reinitialized from sub-seed {sub_seed}"
             if ranks.is_main():
-                tqdm.write(message, file=sys.stderr)  # above the bar, if there is one
+                write_line(message)
             self._record(step, reinitialized=network, sub_seed=sub_seed)
         self.optimizer.step()
         self.scheduler.step()
@@ -256,14 +254,18 @@ class Trainer:
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C or a SIGTERM end the current step first, so that a consistent state is saved."""
+        """Let Ctrl-C, a SIGTERM or a terminal that is closed end the current step first, so that a consistent state is
+        saved."""
 
         def request_stop(*_: Any) -> None:
             self.stop_requested = True
 
-        previous = {}
+        previous, numbers = {}, [signal.SIGINT, signal.SIGTERM]
+        hangup = getattr(signal, "SIGHUP", None)  # not on Windows
+        if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:  # nohup's
+            numbers.append(hangup)
         with suppress(ValueError):  # only the main thread may handle signals
-            previous = {number: signal.signal(number, request_stop) for number in (signal.SIGINT, signal.SIGTERM)}
+            previous = {number: signal.signal(number, request_stop) for number in numbers}
         try:
             yield
         finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
@@ -27,6 +27,7 @@ from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.ray_model import RayModel
 
 FRAMES_PER_SECOND = 20
+MAX_FRAMES = 10**6
 
 
 def render_run(
@@ -49,7 +50,7 @@ def render_run(
         raise InputError("--kind and --camera-path: give one of them")
     if dataparser_transforms is not None and camera_path is None:
         raise InputError("--dataparser-transforms has no effect without --camera-path")
-    check_value("num-frames", num_frames, num_frames >= 1, "at least 1")
+    check_value("num-frames", num_frames, 1 <= num_frames <= MAX_FRAMES, f"from 1 to {MAX_FRAMES}")
     check_value("outputs", outputs, len(outputs) == len(set(outputs)) > 0, "at least one, each once")
     path = None if camera_path is None else read_camera_path(camera_path)
     if path is not None and dataparser_transforms is not None:
@@ -130,15 +131,30 @@ def _write_gif(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: 
 def _write_mp4(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: float) -> None:
     import imageio_ffmpeg
 
-    first = next(frames)
+    first, num_sent = next(frames), 0
     height, width = (side // 2 * 2 for side in first.shape[:2])  # the codec needs even sides
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory(prefix=".", dir=Path(file.name).parent) as folder:  # on the disk that the video is for
         video = Path(folder) / "video.mp4"
         rate: Any = frames_per_second  # typed as an integer; ffmpeg takes any
         writing = imageio_ffmpeg.write_frames(str(video), (width, height), fps=rate, macro_block_size=2)
         with closing(writing) as writer:
             writer.send(None)
             for frame in itertools.chain([first], frames):
-                writer.send(np.ascontiguousarray(frame[:height, :width]))
+                with _ffmpeg_failures():
+                    writer.send(np.ascontiguousarray(frame[:height, :width]))
+                num_sent += 1
+        with _ffmpeg_failures():  # what fails after the last frame was sent is told by nothing else
+            num_written, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
+            if num_written != num_sent:
+                raise OSError(f"{num_written} of {num_sent} frames were written")
         with open(video, "rb") as written:
             shutil.copyfileobj(written, file)
+
+
+@contextmanager
+def _ffmpeg_failures() -> Iterator[None]:
+    """What imageio_ffmpeg raises, as an OSError in one line."""
+    try:
+        yield
+    except (OSError, RuntimeError) as problem:
+        raise OSError(f"ffmpeg: {str(problem).strip().splitlines()[0]}") from problem

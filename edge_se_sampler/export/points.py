@@ -51,9 +51,10 @@ def export_points(run: RunFolder, config: TrainerConfig, path: Path, num_points:
 
 
 def load_points(run: RunFolder, config: TrainerConfig, path: Path, num_points: int, seed: int) -> PointCloud:
-    """A run's points, which are to be written as .ply; InputError if there can be no such number, the file cannot be
-    written, or nothing is opaque."""
+    """A run's points, which are to be written as .ply; InputError if there can be no such number or seed, the file
+    cannot be written, or nothing is opaque."""
     check_value("num-points", num_points, num_points > NEIGHBORS, f"above {NEIGHBORS}")
+    check_value("seed", seed, seed >= 0, "at least 0")
     check_export(path, ".ply")
     model, _ = load_model(run, config)
     return find_points(model, read_train_views(config), num_points, np.random.default_rng(seed))

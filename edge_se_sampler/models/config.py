@@ -112,7 +112,7 @@ class ModelConfig(InstantiateConfig, ABC):
         if not 0 <= near < far < INFINITY:
             raise InputError(f"--{prefix}near is {near}, --{prefix}far {far}: 0 <= near < far")
         size_px = self.voxel_size_px
-        check_value(f"{prefix}voxel-size-px", size_px, 0 < size_px <= 1000, "above 0, at most 1000")
+        check_value(f"{prefix}voxel-size-px", size_px, 0.01 <= size_px <= 1000, "at least 0.01, at most 1000")
 
 
 @dataclass(frozen=True)
