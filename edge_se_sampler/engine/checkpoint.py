@@ -107,8 +107,10 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle, is none, or
     was saved under another configuration."""
     try:
+        file = SourceFile(path, SourceLocation(path))
+        file.check_regular()
         locate_file(path.parent, path.name, SourceLocation(path.parent))
-        content = SourceFile(path, SourceLocation(path)).read_bytes()
+        content = file.read_bytes()
     except InputError as problem:
         raise DamagedCheckpoint(str(problem)) from problem
     header, _, payload = content.partition(b"\n")
