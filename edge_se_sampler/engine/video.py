@@ -143,7 +143,8 @@ def _write_mp4(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: 
                 with _ffmpeg_failures():
                     writer.send(np.ascontiguousarray(frame[:height, :width]))
                 num_sent += 1
-        with _ffmpeg_failures():  # what fails after the last frame was sent is told by nothing else
+        with _ffmpeg_failures():
+            # imageio_ffmpeg ignores ffmpeg's exit status: only the file shows that encoding failed at the end
             num_written, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
             if num_written != num_sent:
                 raise OSError(f"{num_written} of {num_sent} frames were written")
