@@ -11,7 +11,7 @@ from edge_se_sampler.data.config import Masks as MeaningOfMasks
 from edge_se_sampler.engine.config import PipelineConfig, TrainerConfig
 from edge_se_sampler.errors import check_value
 from edge_se_sampler.methods import registered_methods
-from edge_se_sampler.models.config import LeanModelConfig, ModelConfig, NeRFModelConfig
+from edge_se_sampler.models.config import MAX_RAYS, LeanModelConfig, ModelConfig, NeRFModelConfig
 from edge_se_sampler.run_commands import Eval, Export, Render, Resume, View
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
@@ -156,7 +156,7 @@ class Show(_Data):
 
         rays = self.pixel_sampler.num_rays_per_batch
         check_value("num-views", self.num_views, self.num_views >= 1, "at least 1")
-        check_value("pixel-sampler.num-rays-per-batch", rays, rays >= 1, "at least 1")
+        check_value("pixel-sampler.num-rays-per-batch", rays, 1 <= rays <= MAX_RAYS, f"from 1 to {MAX_RAYS}")
         check_output(self.output_path)
         views = self._read(NeRFModelConfig())
         config = EdgeSEPixelSamplerConfig(**vars(self.pixel_sampler))

@@ -115,6 +115,7 @@ SETTINGS = [
     (["--pipeline.datamanager.pixel-sampler.early-fraction", "1.5"], "early-fraction"),
     (["--pipeline.datamanager.pixel-sampler.early-steps", "9"], "schedule"),
     (["--pipeline.datamanager.pixel-sampler.edge-epsilon", "0"], "edge-epsilon"),
+    (["--pipeline.datamanager.pixel-sampler.se-candidates", "1" + 17 * "0"], "to 1000"),
     (["--max-num-iterations", "0"], "--max-num-iterations"),
     (["--machine.seed", str(2**63)], "--machine.seed"),
     (["--max-seconds", "nan"], "--max-seconds"),
@@ -239,6 +240,7 @@ class TestRuns:
             (lambda c: c.update(steps_per_log=1.5), "steps_per_log"),
             (lambda c: c.update(data=None, checksum=None), "data"),
             (lambda c: c.update(format=4), "format"),
+            (lambda c: c["pipeline"]["model"].update(size="auto") or c.update(checksum=None), "size"),
         ],
     )
     def test_with_a_config_of_another_version(self, run: Path, edge_se, change, named: str):
@@ -283,6 +285,10 @@ class TestRuns:
         assert "--outputs" in refused(edge_se, run, "render", run, "--outputs", "rgb", "rgb")
         for path in (".", tmp_path):
             assert "must name a file" in refused(edge_se, run, "eval", run, "--output-path", path)
+        for content in ("{}", "no json"):
+            (tmp_path / "other.json").write_text(content)
+            assert "no evaluation" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "other.json")
+            assert (tmp_path / "other.json").read_text() == content
         os.mkfifo(tmp_path / "pipe")
         assert "no regular file" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "pipe")
         assert (tmp_path / "pipe").is_fifo()
@@ -304,8 +310,9 @@ def test_outputs_of_show_and_inspect_that_cannot_be_written(command: str, scene:
     for path in (".", tmp_path, tmp_path / "no" / "x.png"):
         assert "--output-path" in refused(edge_se, tmp_path, command, "--data", scene, "--output-path", path)
     if command == "show":
-        flags = ["--data", scene, "--output-path", tmp_path / "x.png", "--pixel-sampler.num-rays-per-batch", -5]
-        assert "num-rays-per-batch is -5" in refused(edge_se, tmp_path, "show", *flags)
+        flags = ["--data", scene, "--output-path", tmp_path / "x.png", "--pixel-sampler.num-rays-per-batch"]
+        for count in (-5, 10**20):
+            assert f"num-rays-per-batch is {count}" in refused(edge_se, tmp_path, "show", *flags, count)
 
 
 def test_too_little_memory_is_one_line(scene: Path, tmp_path: Path, edge_se):

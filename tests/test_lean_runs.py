@@ -203,6 +203,7 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
         ("--pipeline.model.step-size-voxels", "nan", "step-size-voxels is nan"),
         ("--pipeline.model.step-size-voxels", "1e-6", "at least 0.05"),
         ("--pipeline.model.voxel-size-px", "1e300", "at most 1000"),
+        ("--pipeline.model.far", "1e308", "far <= 1e+25"),
         ("--reinit-dead", "True", "cannot die"),
         ("--pipeline.datamanager.pixel-sampler.error-source", "coarse", "no coarse network"),
     ):
@@ -217,8 +218,10 @@ def test_commands_refuse_what_has_no_meaning(scene: Path, tmp_path: Path, edge_s
     assert not (tmp_path / "out").exists()
 
 
-def test_from_the_command_line(scene: Path, tmp_path: Path, edge_se: Any) -> None:
+@pytest.mark.parametrize("far", [6.0, 1e25])
+def test_from_the_command_line(far: float, scene: Path, tmp_path: Path, edge_se: Any) -> None:
     flags = ["--data", scene, "--output-dir", tmp_path / "out", "--max-num-iterations", "8"]
+    flags += ["--pipeline.model.far", far]
     assert edge_se("train", "lean-nerf", *flags).code == 0
     (run,) = (tmp_path / "out").glob("*/lean-nerf/*")
     answer = edge_se("eval", run, "--output-path", tmp_path / "eval.json")

@@ -107,7 +107,9 @@ BAD_ARGUMENTS = [
     pytest.param({"placement": "centred"}, "placement is 'centred'.*centered", id="placement"),
     pytest.param({"placement": "shifted", "offset": (0.4, 0)}, "offset.*4 pixels.*8", id="offset"),
     pytest.param({"placement": "rotated", "offset": (0, -0.6)}, "offset.*0 pixels.*8", id="offset off the image"),
-    pytest.param({"placement": "shifted", "offset": (math.nan, 0)}, "offset.*finite", id="offset nan"),
+    pytest.param({"placement": "shifted", "offset": (math.nan, 0)}, "offset.*-1 to 1", id="offset nan"),
+    pytest.param({"placement": "shifted", "offset": (1e308, 0)}, "offset.*-1 to 1", id="huge offset"),
+    pytest.param({"num_test": 10**20}, "num_test is 1.*at most", id="huge test"),
     pytest.param(
         {"names": ["hotdog"], "placement": "rotated", "offset": (0.3, 0.3)},
         "offset rotates hotdog to the edge.*train/r_0",

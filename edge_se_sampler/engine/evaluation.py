@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from edge_se_sampler.data.scene_file import read_json
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
 from edge_se_sampler.engine.metrics import composite_on, compute_metrics, psnr
@@ -15,6 +16,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import Picture, render_view, to_pictures
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_ensemble, read_test_views
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.ray_model import RayModel
 
 
@@ -46,8 +48,10 @@ def evaluate_run(
     runs: Sequence[tuple[RunFolder, TrainerConfig]], output_path: Path, render_output_path: Path | None
 ) -> dict[str, Any]:
     """Evaluate the last checkpoint of a run, or of several in the mean, on the first one's held-out views, and write a
-    json with the keys of nerfstudio's eval."""
+    json with the keys of nerfstudio's eval. InputError if a file is there that is no such json."""
     check_output(output_path)
+    if output_path.exists() and not _is_evaluation(output_path):
+        raise InputError(f"--output-path {output_path}: is no evaluation, and would be replaced by one; name another")
     model, checkpoints = load_ensemble(runs)
     config = runs[0][1]
     pictures = to_pictures(read_test_views(config))
@@ -66,3 +70,10 @@ def evaluate_run(
     others = {"averaged_with": [str(path) for path in checkpoints[1:]]} if len(checkpoints) > 1 else {}
     write_json(output_path, names | {"checkpoint": str(checkpoints[0]), **others, "results": results})
     return results
+
+
+def _is_evaluation(path: Path) -> bool:
+    try:
+        return "results" in read_json(path).object()
+    except InputError:
+        return False

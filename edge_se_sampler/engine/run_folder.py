@@ -84,6 +84,8 @@ class RunFolder:
         if claimed not in (None, checksum(written)):
             remedy = 'restore it, or, if you did, remove its "checksum"'
             raise InputError(f"{path}: changed since it was written (checksum); {remedy}")
+        if config.pipeline.model.size == "auto":
+            raise InputError(f"{path}: the model's size is auto, and a run's is decided; restore it")
         try:
             config.check()
         except InputError as problem:

@@ -43,7 +43,8 @@ def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Pa
     config.check()
     distribution = PIXEL_STRATEGIES[strategy].load()(config)
     batch = ImageBatch.of(image_batch(views), use_mask=not config.ignore_mask)
-    chosen = np.unique(np.linspace(0, len(views.images) - 1, num_views).round().astype(int)).tolist()
+    last = len(views.images) - 1
+    chosen = np.unique(np.linspace(0, last, min(num_views, last + 1)).round().astype(int)).tolist()
     figure, axes = pyplot.subplots(len(chosen), 3, figsize=(9.6, 3.35 * len(chosen)), squeeze=False)
     for row, k in zip(axes, chosen, strict=True):
         try:

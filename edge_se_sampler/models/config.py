@@ -11,6 +11,8 @@ from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 
 INFINITY = float("inf")
+MAX_DEPTH = 1e25
+"""World units: farther away float32 knows no sizes."""
 MAX_SAMPLES, MAX_RAYS = 2**14, 2**24
 """Of a ray along it, and rays of a step: more would be a mistake, or a stranger's."""
 BYTES_PER_RAY = 2**15
@@ -109,8 +111,8 @@ class ModelConfig(InstantiateConfig, ABC):
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
         near, far = self.depths
-        if not 0 <= near < far < INFINITY:
-            raise InputError(f"--{prefix}near is {near}, --{prefix}far {far}: 0 <= near < far")
+        if not 0 <= near < far <= MAX_DEPTH:
+            raise InputError(f"--{prefix}near is {near}, --{prefix}far {far}: 0 <= near < far <= {MAX_DEPTH:g}")
         size_px = self.voxel_size_px
         check_value(f"{prefix}voxel-size-px", size_px, 0.01 <= size_px <= 1000, "at least 0.01, at most 1000")
 

@@ -33,7 +33,7 @@ def check_grid(state: Mapping[str, Tensor]) -> None:
     scales = torch.stack((state["cell_size"], state["finest_size"]))
     if not ((scales > 1e-30) & (scales < 1e30)).all() or not (state["aabb_min"].abs() < 1e30).all():
         raise ValueError("its box is none")
-    if not 0 <= int(state["level"]) <= int(state["max_level"]) < 64:
+    if not 0 <= int(state["level"]) <= int(state["max_level"]) < 128:
         raise ValueError("its level is none")
     size, bricks = state["size"], state["bricks"]
     if not ((size >= 1) & (size <= MAX_SIZE)).all():

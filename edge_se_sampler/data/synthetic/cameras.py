@@ -93,8 +93,8 @@ def framing(size: int, placement: Placement = "centered", offset: tuple[float, f
         raise InputError(f"placement is {placement!r}: give one of {', '.join(get_args(Placement))}")
     if placement == "centered":
         offset = (0.0, 0.0)
-    if not all(math.isfinite(fraction) for fraction in offset):
-        raise InputError(f"offset is {tuple(offset)}: give two finite numbers, fractions of the image's side")
+    if not all(abs(fraction) <= 1 for fraction in offset):
+        raise InputError(f"offset is {tuple(offset)}: give two numbers from -1 to 1, fractions of its side")
     shift = (round(offset[0] * size), round(offset[1] * size))
     frame = size - 2 * max(abs(shift[0]), abs(shift[1]))
     if frame < MIN_FRAME:

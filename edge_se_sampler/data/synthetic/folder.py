@@ -22,6 +22,9 @@ from edge_se_sampler.data.synthetic.render import render
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.interrupts import interrupts_blocked, interrupts_delayed
 
+MAX_VIEWS = 10**6
+"""Of a split."""
+
 
 @dataclass(frozen=True)
 class _View:
@@ -69,8 +72,8 @@ def make_scenes(
     if len(set(names)) < len(names):
         raise InputError(f"names has a scene twice ({', '.join(names)}): give each once")
     for split, count in counts.items():
-        if count < (minimum := int(split == "train")):
-            raise InputError(f"num_{split} is {count}: give at least {minimum}")
+        if not (minimum := int(split == "train")) <= count <= MAX_VIEWS:
+            raise InputError(f"num_{split} is {count}: give at least {minimum}, at most {MAX_VIEWS}")
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}: give a number from 0 to {2**31 - 1}")
     frame = framing(size, placement, offset)
