@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from edge_se_sampler.engine.config import TrainerConfig
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.export.commands import ExportCameras, ExportMesh, ExportPoints, ExportSplats
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.ranks import is_main
@@ -159,6 +160,8 @@ class View(ViewerConfig, _RunCommand):
 
             view_run(*self._load(), self)
         else:
+            if (self.host, self.port) != (ViewerConfig.host, ViewerConfig.port):
+                raise InputError("--host and --port have no effect with --html, which needs no server; leave them out")
             from edge_se_sampler.viewer.html import write_html
 
             write_html(*self._load(), self.html)

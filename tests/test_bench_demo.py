@@ -58,6 +58,8 @@ def test_the_demo_prints_its_result_and_leaves_pictures_a_page_and_a_json(tmp_pa
     pictures, box = {name: np.ones((8, 8, 3)) for name in ("truth", *methods)}, (slice(4), slice(4))
     with_numba = demo._page(tmp_path / "seed-3" / "demo.gif", result | {"numba": True}, pictures, box)
     assert ["numba is not installed" in text for text in (page, with_numba)] == [True, False]
+    strange = demo._page(tmp_path / "seed-3" / "demo.gif", result | {"command": "edge-se demo '<b>&'"}, pictures, box)
+    assert "edge-se demo &#x27;&lt;b&gt;&amp;&#x27;" in strange
 
 
 def _check_self_contained(page: str, gif: bytes) -> None:

@@ -16,6 +16,7 @@ from edge_se_sampler.bench.real.command import BenchReal
 from edge_se_sampler.bench.real.figures import draw_chart
 from edge_se_sampler.bench.real.published import PUBLISHED
 from edge_se_sampler.bench.real.report import describe, draw
+from edge_se_sampler.bench.real.summary import seconds_of
 from edge_se_sampler.bench.real.trials import MEMBERS, VARIANTS, Settings, Trial, run_trial, training_length
 from edge_se_sampler.bench.runner import new_result, write_result
 from edge_se_sampler.data.synthetic.folder import make_scenes
@@ -111,6 +112,7 @@ def test_budgets_of_steps_are_told_where_one_thing_is_changed_and_nowhere_else(t
     folder = result_of(tmp_path, runs)
     page = describe(folder)
     changed = page.split("## One thing changed")[1]
+    assert [seconds_of(budget) for budget in ("90", "90s", " 10m ", "1h")] == [90, 90, 600, 3600]
     assert "| lego, 400 px | 500 steps | no hull | 25.10 | +0.10 | 1 | 1.00 |" in changed
     assert "| lego, 400 px | 2000 steps | no hull | 28.00 | -1.00 | 1 | 0.50 |" in changed
     assert changed.index("500 steps") < changed.index("2000 steps")

@@ -58,14 +58,23 @@ def test_folders_without_results_and_texts_without_markers_are_refused(
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "plain.md").write_text("no markers")
+    (tmp_path / "latin.md").write_bytes("für".encode("latin-1"))
     for options, message in (
         ((tmp_path / "empty",), "no result of edge-se bench lies there"),
         ((folder, "--readme", tmp_path / "none.md"), "cannot be read"),
         ((folder, "--readme", tmp_path / "plain.md"), "has no marker <!-- table: methods -->"),
+        ((folder, "--readme", tmp_path / "latin.md"), "is not UTF-8 text (byte 1)"),
     ):
         answer = edge_se("bench", "report", *options)
         assert answer.code == 2, answer
         assert message in answer.err
+
+
+def test_results_of_others_in_a_subfolder_change_nothing(folder: Path) -> None:
+    expected = report_of(folder)
+    (folder / "earlier").mkdir()
+    shutil.copy(CONFIGS / "processes" / "result.json", folder / "earlier")
+    assert report_of(folder) is expected
 
 
 def test_a_template_is_filled_without_the_sections_and_pictures_that_are_missing(tmp_path: Path) -> None:

@@ -126,9 +126,41 @@ def test_a_failing_trial_is_reported_stops_no_other_and_is_tried_again(
         {"scene": "mic", "seed": 1, "error": "FloatingPointError: the loss is not finite at step 3"}
     ]
     assert "mic, 1, FloatingPointError: the loss is not finite at step 3" in capsys.readouterr().out
+    list_trials(toy_experiment(), tmp_path)
+    assert "3 trainings, 1 of them pending" in capsys.readouterr().out
     again = run_experiment(toy_experiment(fail_once), tmp_path, one_thread)
     assert [run["seed"] for run in again["runs"]] == [0, 1, 2]
     assert again["errors"] == []
+
+
+def test_a_number_that_is_not_finite_is_an_error_of_its_trial(tmp_path: Path) -> None:
+    experiment = toy_experiment(lambda trial: {"psnr": 20.0 if trial.seed else float("nan")})
+    result = run_experiment(experiment, tmp_path, one_thread)
+    assert [run["seed"] for run in result["runs"]] == [1, 2]
+    assert [error["seed"] for error in result["errors"]] == [0]
+    assert read_result(tmp_path / "result.json")["runs"] == result["runs"]
+
+
+@pytest.mark.parametrize("folder", ["R&D", "a[1]", "x#1", "../up", "<b>"])
+def test_any_path_that_is_text_may_be_in_the_command(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy", "--output-dir", folder])
+    trained = []
+    for _ in range(2):  # as it is, and read again
+        run_experiment(toy_experiment(lambda trial: trained.append(1) or train(trial)), tmp_path, one_thread)
+        assert len(trained) == 3
+
+
+@pytest.mark.parametrize(("command", "scene"), [("a`b", "mic"), ("a\nb", "mic"), ("\udcff", "mic"), ("x", "<b>mic")])
+def test_what_a_page_cannot_show_is_refused_before_anything_is_trained(
+    command: str, scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy", "--output-dir", command])
+    experiment = toy_experiment(lambda _: pytest.fail("trained"), lambda _: [ToyTrial(scene, 0)])
+    with pytest.raises(InputError, match="which a page could not show"):
+        run_experiment(experiment, tmp_path / "new", one_thread)
+    assert not (tmp_path / "new").exists()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,10 +269,14 @@ def test_shards_train_each_trial_once_and_are_put_together(tmp_path: Path, monke
         assert [trial.seed for trial in trained] == expected
     assert not (tmp_path / "result.json").exists()
     (tmp_path / "shards" / "1-of-2.json").rename(tmp_path / "shards" / "of_another_machine.json")
+    for path in (tmp_path / "shards").iterdir():
+        shard = read_result(path)
+        write_result(path, shard | {"machine": shard["machine"] | {"processor": "another"}})
     monkeypatch.setattr(sys, "argv", ["edge-se", "bench", "toy"])
     result = run_experiment(toy_experiment(lambda _: pytest.fail("trained")), tmp_path, one_thread)
     assert read_result(tmp_path / "result.json") == json.loads(json.dumps(result))
     assert [run["psnr"] for run in result["runs"]] == [20.0, 21.0, 22.0]
+    assert result["machine"]["processor"] == "another"
     commands = ["edge-se bench toy --shard 1/2", "edge-se bench toy --shard 2/2", "edge-se bench toy"]
     assert sorted(result["command"].splitlines()) == sorted(commands)
 

@@ -32,3 +32,8 @@ def test_the_command_writes_every_time(tmp_path: Path, edge_se: Any) -> None:
     readme = (tmp_path / "out" / "README.md").read_text()
     for milliseconds in result["milliseconds"].values():
         assert f"| {milliseconds:.2f} ms |" in readme
+    result["milliseconds"] |= {"Edge, of all images": 0.0}
+    (tmp_path / "out" / "samplers.json").write_text(json.dumps(result))
+    answer = edge_se("bench", "report", tmp_path / "out")
+    assert answer.code == 2
+    assert "checksum" in answer.err

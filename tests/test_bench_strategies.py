@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import statistics
 from dataclasses import asdict, replace
 from itertools import product
@@ -15,7 +16,7 @@ import pytest
 from edge_se_sampler.bench.runner import new_result, write_result
 from edge_se_sampler.bench.strategies.claims import CLAIMS
 from edge_se_sampler.bench.strategies.command import BenchStrategies
-from edge_se_sampler.bench.strategies.report import describe, describe_use, draw, tables
+from edge_se_sampler.bench.strategies.report import describe, describe_use, draw, table_of_claims, tables
 from edge_se_sampler.bench.strategies.summary import (
     Panel,
     best_at_equal_seconds,
@@ -36,6 +37,7 @@ from edge_se_sampler.bench.strategies.trials import (
     Trial,
     read_views,
 )
+from edge_se_sampler.bench.train import offcenter_copies
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.config import MANAGER, MODEL
 from edge_se_sampler.engine.session import resolve_config
@@ -155,6 +157,12 @@ def test_an_off_center_copy_is_made_once(scene: Path, tmp_path: Path) -> None:
     assert read_views(folder, 1, "train").images[0].shape[:2] == (24 + 2 * 4, 24 + 2 * 5)
 
 
+def test_scenes_of_one_name_have_off_center_copies_of_their_own(scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(scene, tmp_path / "others" / scene.name)
+    one, other = (offcenter_copies(folder, tmp_path) for folder in (scene, tmp_path / "others" / scene.name))
+    assert one != other
+
+
 def test_bad_flags_are_refused(tmp_path: Path) -> None:
     (tmp_path / "lego").mkdir()
     flags: Any = {"output_dir": tmp_path, "scenes_dir": tmp_path, "scenes": ("lego",)}
@@ -244,7 +252,7 @@ def test_numbers_are_those_of_brute_force() -> None:
         ((25.4, 25.5, 25.3), "same", "no need, not distinguishable in 1 of 1"),
         ((26.0, 26.1, 26.2), "same", "no need, not distinguishable in 1 of 1"),  # so does that of uniform
         ((23.0, 23.1, 23.2), "worse", "no, worse: lean (200 px)"),
-        ((29.0,), None, "no verdict (one seed) in 1 of 1"),
+        ((29.0,), None, "no verdict (too few seeds) in 1 of 1"),
         ((24.0, 27.0, 27.1), "same", "no need, not distinguishable in 1 of 1"),  # its own spread counts
     ],
 )
@@ -277,7 +285,7 @@ def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
             more = {"downscale": downscale, "size": [800 // downscale] * 2}
             runs += [run_of(25 + seed / 10, seed, **more), run_of(25 + offset, seed, "edge", **more)]
     expected = "yes, better: lean (200 px); worse: lean (100 px); not distinguishable in 1 of 4"
-    assert describe_use(runs, "edge") == f"{expected}; no verdict (one seed) in 1 of 4"
+    assert describe_use(runs, "edge") == f"{expected}; no verdict (too few seeds) in 1 of 4"
     less = [run for run in runs if run["downscale"] >= 8]
     assert describe_use(less, "edge") == "no, worse: lean (100 px); not distinguishable in 1 of 2"
     assert describe_use(less, "se") == "–"
@@ -338,8 +346,23 @@ def test_the_page_shows_the_numbers(tmp_path: Path) -> None:
     assert "| lean, 200 px | edge | +1.10 | better |" in page
     assert "| lean +1.10, a step x2.00 | yes, better: lean (200 px) |" in tables(tmp_path)["strategies"]
     assert "broken" in page
+    assert "failed" not in tables(tmp_path)["strategies"]
     assert "10 s or 800 steps" in page
     assert "ended in an error" not in describe(folder_of(tmp_path, runs))
+
+
+def test_failures_that_are_told_beside_seconds_are_those_at_equal_seconds() -> None:
+    runs = [run_of(25.0 + seed, seed, name) for name in ("uniform", "edge") for seed in range(3)]
+    runs += [run_of(9.0, seed, "edge", plan="steps", outcome="collapsed") for seed in range(3)]
+    assert "failed" not in table_of_claims(runs)
+    runs += [run_of(9.0, 3, "edge", outcome="collapsed")]
+    assert ", 1 failed" in table_of_claims(runs)
+
+
+def test_errors_are_shown_as_they_are(tmp_path: Path) -> None:
+    error = "ValueError: <img src=x onerror=alert(1)>`\n[x](javascript:1) \udcff"
+    page = describe(folder_of(tmp_path, [run_of(25.0, 0)], ({"model": "lean", "error": error},)))
+    assert "- `lean, ValueError: <img src=x onerror=alert(1)>  [x](javascript:1)  `" in page
 
 
 def test_the_picture_has_a_part_for_every_panel(tmp_path: Path) -> None:

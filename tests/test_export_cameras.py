@@ -100,6 +100,8 @@ def test_cameras_that_differ_are_with_their_frames_and_masks_too(tmp_path: Path)
     (written := tmp_path / "cameras.json").rename(tmp_path / "transforms.json")
     assert not written.exists()
     exported = json.loads((tmp_path / "transforms.json").read_text())
+    masks = [iio.imread(tmp_path / frame["mask_path"]) for frame in exported["frames"]]  # nerfstudio wants all or none
+    assert [mask.shape == (HEIGHT, document["w"]) and mask.min() == 255 for mask in masks].count(False) == 1
     assert exported["camera_model"] == "OPENCV"
     assert "fl_x" not in exported
     assert "h" in exported["frames"][0]  # all or none: nerfstudio takes what is at the top for all
@@ -156,6 +158,24 @@ def test_blender_lists_are_not_overwritten(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="not overwritten"):
             export_cameras(config_of(tmp_path, "auto"), tmp_path / name)
     assert (tmp_path / "transforms_train.json").read_bytes() == before
+
+
+def test_lists_of_a_format_that_was_not_chosen_are_not_overwritten_either(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    write_scene(tmp_path)
+    before = (tmp_path / "transforms.json").read_bytes()
+    with pytest.raises(InputError, match="not overwritten"):
+        export_cameras(config_of(tmp_path, "blender"), tmp_path / "transforms.json")
+    assert (tmp_path / "transforms.json").read_bytes() == before
+
+
+def test_without_held_out_views_nothing_is_listed(tmp_path: Path) -> None:
+    """nerfstudio stops where it finds some of the lists."""
+    write_scene(tmp_path, 3)
+    export_cameras(config_of(tmp_path, "blender"), tmp_path / "transforms.json")
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    assert len(document["frames"]) == 3
+    assert not [key for key in document if key.endswith("_filenames")]
 
 
 def test_data_that_is_gone_is_an_error(tmp_path: Path, edge_se: Callable) -> None:

@@ -155,6 +155,16 @@ def test_a_folder_filled_meanwhile_is_never_touched(tmp_path: Path) -> None:
     assert everything_below(tmp_path) == {"mic": b"", "mic/notes.txt": b"keep"}
 
 
+def test_what_fills_one_of_two_folders_meanwhile_leaves_no_other(tmp_path: Path) -> None:
+    def intrude(done: int, total: int) -> None:
+        (tmp_path / "mic").mkdir(exist_ok=True)
+        (tmp_path / "mic" / "notes.txt").write_text("keep")
+
+    with pytest.raises(InputError, match="nothing was left there"):
+        make_scenes(tmp_path, ["chair", "mic"], size=8, num_train=1, num_val=0, num_test=0, progress=intrude)
+    assert everything_below(tmp_path) == {"mic": b"", "mic/notes.txt": b"keep"}
+
+
 @pytest.mark.parametrize("out", ["file", "file/below"])
 def test_out_that_is_a_file(out: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("keep")

@@ -19,6 +19,7 @@ from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import SAMPLER, override
 from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.occupancy.hull import find_focus
 from edge_se_sampler.sampling.strategies import RankedError
@@ -220,3 +221,7 @@ def test_an_html_file_begins_behind_the_cameras_that_turn(
     distance = np.linalg.norm(viewed.cameras.camera_to_worlds[:, :, 3].double().numpy() - focus, axis=1)
     assert np.linalg.norm(np.asarray(servers[0].initial_camera.position) - focus) > 1.2 * distance.max()
     assert (tmp_path / "run.html").stat().st_size > 10_000
+    monkeypatch.setattr("edge_se_sampler.export.points.SEEN", 2.0)  # more than there can be
+    with pytest.raises(InputError, match="opaque in no training view"):
+        html.write_html(RunFolder(tmp_path), viewed.trainer.config, tmp_path / "empty.html")
+    assert not (tmp_path / "empty.html").exists()

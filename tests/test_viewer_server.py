@@ -91,6 +91,13 @@ def test_without_viser_the_extra_is_named(run: Path, edge_se, monkeypatch: pytes
         assert "edge-se-sampler[view]" in answer.err
 
 
+def test_an_address_has_no_meaning_for_a_file(run: Path, tmp_path: Path, edge_se) -> None:
+    for flag, value in (("--port", 7008), ("--host", "0.0.0.0")):
+        answer = edge_se("view", run, "--html", tmp_path / "x.html", flag, value)
+        assert answer.code == 2
+        assert "no effect with --html" in answer.err
+
+
 @contextmanager
 def ended(process: subprocess.Popen) -> Iterator[None]:
     """Whatever fails, nothing waits for the process."""

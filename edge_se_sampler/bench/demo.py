@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -47,6 +48,8 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     missing."""
     require_pyplot()
     make_folder(output_dir, "--output-dir")
+    settings = {"scene": SCENE, **SPLITS, "seed": seed, "iterations": ITERATIONS, "time_budget": TIME_BUDGET}
+    head = new_result("demo", settings)
     began = time.monotonic()
     scene = cached_scene(output_dir / "demo", **SCENE, **SPLITS)
     trainers, methods, views = {}, {}, {}
@@ -55,9 +58,8 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
         methods[method], views[method] = _train(trainer)
     test = to_pictures(read_test_views(trainers["lean-nerf"].config))
     write_video(output_dir / "demo.gif", _turntable(trainers["lean-nerf"]), 16)
-    settings = {"scene": SCENE, **SPLITS, "seed": seed, "iterations": ITERATIONS, "time_budget": TIME_BUDGET}
     result = {
-        **new_result("demo", settings),
+        **head,
         "numba": compiled_ops() is not None,
         "background_psnr": float(np.mean([_background_psnr(picture) for picture in test])),
         "seconds": round(time.monotonic() - began, 1),
@@ -202,7 +204,7 @@ def _page(gif: Path, result: Mapping[str, Any], pictures: Mapping[str, np.ndarra
         "torch, several times slower, and got less far in its time.</p>",
         **{key: result["settings"][key] for key in ("seed", "iterations", "num_train", "num_test", "time_budget")},
         size=SCENE["size"],
-        command=result["command"],
+        command=html.escape(result["command"]),
         seconds=f"{result['seconds']:.0f}",
-        machine=describe_machine(result["machine"]),
+        machine=html.escape(describe_machine(result["machine"])),
     )

@@ -24,7 +24,7 @@ def report_of(folder: Path) -> Any:
     pictures there are. Optional: `draw(folder, workplace)` draws the pictures, those that need renderings only where
     the workplace has them; `tables(folder)` are tables by name that other texts show. All raise InputError if the
     result cannot be read or a picture cannot be written, and so does this if no result lies there."""
-    for path in sorted(folder.glob("**/*.json")):
+    for path in sorted(folder.glob("**/*.json"), key=lambda path: (len(path.parts), path)):  # its own before others'
         with suppress(InputError):
             name = read_json(path).object().get("experiment")
             if name in REPORTS:
@@ -43,12 +43,13 @@ def write_report(folder: Path, readme: Path | None = None, workplace: Path | Non
             report.describe(folder)  # what cannot be described is not drawn either
             report.draw(folder, workplace)
         text = report.describe(folder)
+        page = text.encode()
         tables = report.tables(folder) if readme is not None and hasattr(report, "tables") else {}
     except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as problem:
         if isinstance(problem, InputError):
             raise
         raise InputError(f"{folder}: its result is none of edge-se bench ({quote(problem)})") from problem
-    write_atomically(folder / "README.md", text.encode())
+    write_atomically(folder / "README.md", page)
     if readme is not None:
         _fill_markers(readme, tables)
 
@@ -57,7 +58,11 @@ def _fill_markers(path: Path, tables: Mapping[str, str]) -> None:
     """Replace what a text has between `<!-- table: NAME -->` and `<!-- end -->` by the tables of those names.
     InputError if it cannot be read or written, or lacks a marker."""
     with os_errors_as_input_errors(f"{path}: cannot be read"):
-        text = path.read_text(encoding="utf-8")
+        content = path.read_bytes()
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as problem:
+        raise InputError(f"{path}: is not UTF-8 text (byte {problem.start}); save it as that") from problem
     for name, table in tables.items():
         pattern = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
         if not pattern.search(text):
@@ -111,6 +116,12 @@ def _split_notes(folder: Path) -> tuple[str, str]:
     text = notes.read_text(encoding="utf-8") if notes.exists() else ""
     first, _, rest = text.partition("\n")
     return (first[2:].strip(), rest.strip()) if first.startswith("# ") else ("", text.strip())
+
+
+def describe_errors(result: Mapping[str, Any]) -> str:
+    """Trials that failed, and why, a line each; whatever their errors say is shown as it is."""
+    lines = (", ".join(map(str, error.values())) for error in result["errors"])
+    return "\n".join(f"- `{''.join(c if c.isprintable() and c != '`' else ' ' for c in line)}`" for line in lines)
 
 
 def describe_machine(machine: Mapping[str, Any]) -> str:

@@ -94,6 +94,7 @@ def list_trials(experiment: Experiment, output_dir: Path, shard: Shard = ALL) ->
     trials = shard.of(_find_trials(experiment, result["runs"]))
     for trial in trials:
         print(*asdict(trial).values(), sep=" | ")
+    result["errors"] = []  # which are trained again
     print(f"{len(trials)} trainings, {len(pending(trials, result))} of them pending")
 
 
@@ -118,24 +119,31 @@ def run_experiment(
 
 
 def _find_trials(experiment: Experiment, runs: list[Run]) -> list[Any]:
-    """All trials that are known after some runs, each once; InputError if there are none."""
+    """All trials that are known after some runs, each once; InputError if there are none, or a page could not show
+    their names."""
     trials = list(dict.fromkeys(experiment.trials(runs)))
     if not trials:
         raise InputError(f"bench {experiment.name}: there is no training of what the flags choose; choose more")
+    try:
+        check_plain(json.loads(json.dumps([asdict(entry) for entry in (experiment.settings, *trials)])))
+    except ValueError as problem:
+        raise InputError(f"bench {experiment.name}: {problem}, which a page could not show; rename it") from problem
     return trials
 
 
 def _load_with_shards(experiment: Experiment, output_dir: Path) -> tuple[dict[str, Any], bool]:
-    """An experiment's result with the runs that only shards have, and whether there are any. InputError as
-    `load_or_create`, and where there is no trial."""
+    """An experiment's result with the runs that only shards have, and whether there are any; measured where the first
+    of them was, unless there was a result. InputError as `load_or_create`, and where there is no trial."""
     names = [field.name for field in fields(_find_trials(experiment, [])[0])]
     path = output_dir / "result.json"
     result = load_or_create(path, experiment.name, experiment.settings)
     _check_runs(experiment, result, path)
-    before = len(result["runs"])
+    before, is_first = len(result["runs"]), not path.exists()
     for path in sorted((output_dir / "shards").glob("*.json")):
         shard = load_or_create(path, experiment.name, experiment.settings)
         _check_runs(experiment, shard, path)
+        if is_first:
+            result["machine"], is_first = shard["machine"], False
         runs = {tuple(run[name] for name in names): run for run in [*shard["runs"], *result["runs"]]}
         result["runs"] = [runs[key] for key in sorted(runs)]
         result["command"] = "\n".join(dict.fromkeys([*shard["command"].splitlines(), *result["command"].splitlines()]))
@@ -172,12 +180,27 @@ def new_result(experiment: str, settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _command() -> str:
-    return shlex.join(["edge-se", *sys.argv[1:]])
+    """The command line; InputError if a page could not show it."""
+    command = shlex.join(["edge-se", *sys.argv[1:]])
+    try:
+        _check_command(command)
+    except ValueError as problem:
+        raise InputError(f"{problem}, which a page could not show; rename it") from problem
+    return command
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A result.json; InputError if it cannot be read, is no result of this version or the one before, or is not as it
-    was written."""
+    """A result.json; InputError as `read_measured`, or if it has no runs and errors."""
+    result = read_measured(path)
+    entries = (result.get("runs"), result.get("errors"))
+    if not all(isinstance(e, list) and all(isinstance(entry, dict) for entry in e) for e in entries):
+        raise InputError(f"{path}: not a result of edge-se bench (runs and errors are lists of objects)")
+    return result
+
+
+def read_measured(path: Path) -> dict[str, Any]:
+    """A json of results, of trainings or others; InputError if it cannot be read, is none of this version or the one
+    before, or is not as it was written."""
     result = read_json(path).object()
     claimed = result.pop("checksum", None)
     try:
@@ -187,8 +210,6 @@ def read_result(path: Path) -> dict[str, Any]:
             raise ValueError("changed since it was written (checksum)")
         if not {"experiment", "command", "settings", "machine"} <= result.keys():
             raise KeyError("experiment, command, settings or machine")
-        if not all(isinstance(entry, dict) for entry in [*result["runs"], *result["errors"]]):
-            raise TypeError("runs and errors are lists of objects")
         check_texts(result)
     except (ValueError, KeyError, TypeError, RecursionError) as problem:
         raise InputError(f"{path}: not a result of edge-se bench ({quote(problem)})") from problem
@@ -198,7 +219,13 @@ def read_result(path: Path) -> dict[str, Any]:
 def check_texts(result: dict[str, Any]) -> None:
     """ValueError or TypeError if a result's texts could be more than that in a page, see `check_plain`."""
     check_plain({key: value for key, value in result.items() if key not in ("errors", "command")})
-    check_plain([line.replace("..", "") for line in str(result["command"]).splitlines()])  # paths of one's own
+    _check_command(str(result["command"]).replace("\n", ""))
+
+
+def _check_command(command: str) -> None:
+    """ValueError if a command line could be more than that between a page's backticks."""
+    if "`" in command or not command.isprintable():
+        raise ValueError(f"a command with a backtick, or no text: {quote(command)}")
 
 
 def check_plain(value: Any) -> None:
@@ -264,14 +291,16 @@ def _run_trials(
 
 def _store(result: dict[str, Any], trial: Any, future: Future[Run]) -> None:
     """Add a finished trial to the runs, or to the errors."""
-    problem = future.exception()
-    if isinstance(problem, (BrokenExecutor, KeyboardInterrupt)):
-        raise problem
-    if problem is None:
-        result["runs"].append({**asdict(trial), **future.result()})
-        result["runs"].sort(key=lambda run: [run[key] for key in asdict(trial)])
-    else:
+    try:
+        run = {**asdict(trial), **future.result()}
+        json.dumps(run, allow_nan=False)  # a ValueError where a number is not finite
+    except BaseException as problem:  # another process's SystemExit, too
+        if isinstance(problem, (BrokenExecutor, KeyboardInterrupt)):
+            raise
         result["errors"].append({**asdict(trial), "error": f"{type(problem).__name__}: {problem}"})
+    else:
+        result["runs"].append(run)
+        result["runs"].sort(key=lambda run: [run[key] for key in asdict(trial)])
 
 
 def executor_factory(workers: int, scheduler: str | None) -> ExecutorFactory:

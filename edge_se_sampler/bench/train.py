@@ -39,7 +39,7 @@ def cached_scene(workplace: Path, name: str, **options: Any) -> Path:
 def offcenter_copies(scene: Path, workplace: Path) -> Path:
     """The folder of a Blender folder's copies by `offcenter`, "centered" and "shifted", in workplace/offcenter, made if
     missing; raises as `offcenter`."""
-    folder = workplace / "offcenter" / scene.name
+    folder = workplace / "offcenter" / Path(*scene.resolve().parts[1:])
     if not folder.exists():
         with unless_made_meanwhile(folder), Progress(0, f"moving {scene.name} off center") as progress:
             offcenter(scene, folder, progress=progress.update)

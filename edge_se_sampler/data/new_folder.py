@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -18,7 +19,7 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
     On any exception nothing is left behind. InputError if a target is there and not empty, or no longer empty at the
     end, or `out` cannot be written, be it that the disk is full or a name too long."""
     _check_not_taken(out, targets)
-    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
+    missing, moved = [folder for folder in (out, *out.parents) if not folder.exists()], []
     try:
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -31,7 +32,10 @@ def staged_folders(out: Path, targets: Sequence[Path]) -> Iterator[Path]:
                 if target.exists():
                     target.rmdir()  # empty, or this raises
                 (Path(workspace.name) / target.name).rename(target)
+                moved.append(target)
     except BaseException as error:
+        for folder in moved:
+            shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # other programs' files have come in between: they stay
             for folder in missing:
                 folder.rmdir()

@@ -14,7 +14,7 @@ from edge_se_sampler.data.dataset import DataSettings, find_format, list_frames
 from edge_se_sampler.data.frames import Frame
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, write_json
+from edge_se_sampler.engine.files import check_output, write_image, write_json
 from edge_se_sampler.engine.session import select_views
 from edge_se_sampler.errors import InputError
 
@@ -32,8 +32,10 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     lists = {
         "blender": [blender_path(config.data, split) for split in SPLITS],
         "transforms": [transforms_path(config.data)],
-    }.get(find_format(config.data, config.data_format), [])
-    if os.path.realpath(path) in map(os.path.realpath, lists):
+    }
+    own = lists.get(find_format(config.data, config.data_format), [])
+    others = [other for paths in lists.values() for other in paths if other.exists()]  # of the same images
+    if os.path.realpath(path) in map(os.path.realpath, (*own, *others)):
         raise InputError(f"--output-path {path}: the data itself, which is not overwritten; give another file")
     settings = DataSettings(config.data_format, eval_every=config.eval_every)
     splits = {split: list_frames(config.data, split, settings) for split in SPLITS}
@@ -42,10 +44,10 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     # nerfstudio wants both
     splits["val"], splits["test"] = splits["val"] or splits["test"], splits["test"] or splits["val"]
     frames = {frame.image.path: describe_frame(frame, path.parent) for split in SPLITS for frame in splits[split]}
+    _mask_all(list(frames.values()), path.parent)
     content = share_intrinsics(list(frames.values()))
-    for split in SPLITS:
-        if splits[split]:
-            content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
+    for split in SPLITS if splits["test"] else ():  # nerfstudio wants all lists or none
+        content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
     if (path.parent / POINTS_NAME).is_file():
         content["ply_file_path"] = POINTS_NAME
     write_json(path, content)
@@ -66,6 +68,16 @@ def describe_frame(frame: Frame, folder: Path) -> dict[str, Any]:
         entry |= dict(zip(names, lens.coefficients, strict=True))
         entry["camera_model"] = "OPENCV_FISHEYE" if lens.fisheye else "OPENCV"
     return entry
+
+
+def _mask_all(frames: list[dict[str, Any]], folder: Path) -> None:
+    """If some frames have masks, give the others one that says that all is known, written into the folder: nerfstudio
+    wants masks of all frames or of none."""
+    without = [frame for frame in frames if "mask_path" not in frame]
+    for frame in without if len(without) < len(frames) else ():
+        frame["mask_path"] = f"all-known-{frame['w']}x{frame['h']}.png"
+        if not (folder / frame["mask_path"]).exists():
+            write_image(folder / frame["mask_path"], np.full((frame["h"], frame["w"]), 255, np.uint8))
 
 
 def relative_path(file: Path, folder: Path) -> str:

@@ -61,10 +61,8 @@ def load_points(run: RunFolder, config: TrainerConfig, path: Path, num_points: i
 
 
 def find_points(model: RayModel, views: Views, num_points: int, rng: np.random.Generator) -> PointCloud:
-    """Points as `find_positions`, with normals; InputError if there are hardly any."""
+    """Points as `find_positions`, with normals."""
     values = find_positions(model, views.cameras, views.masks, num_points, rng)
-    if len(values) <= NEIGHBORS:
-        raise InputError("the model is opaque in no training view: it has learned nothing; train for longer")
     positions, directions, colors, opacity = np.split(values, (3, 6, 9), axis=1)
     normals, spacing = find_normals(positions, directions)
     return PointCloud(positions, normals, colors, opacity[:, 0], spacing)
@@ -79,7 +77,7 @@ def find_positions(
 ) -> np.ndarray:
     """Where the rays of randomly chosen pixels, no one twice, meet something: at most so many rows (n, 10) of a
     position in world units, the ray's direction, color and opacity. A point between two surfaces, the mean of a ray
-    that sees both, is left out where the model's cells are empty.
+    that sees both, is left out where the model's cells are empty. InputError if there are hardly any.
 
     Args:
         masks: (H, W) bool of each camera: the pixels that are known; None: all.
@@ -109,6 +107,8 @@ def find_positions(
             progress.update(min(count, num_points))
             if count >= num_points:
                 break
+    if count <= NEIGHBORS:
+        raise InputError("the model is opaque in no training view: it has learned nothing; train for longer")
     return torch.cat(found)[:num_points].double().numpy()
 
 

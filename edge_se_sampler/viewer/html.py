@@ -27,7 +27,7 @@ DISTANCE = 1.5
 
 
 def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
-    """Write a run as one html file; InputError for a bad run, data or output."""
+    """Write a run as one html file; InputError for a bad run, data or output, or where nothing is opaque."""
     check_viser()
     check_output(path, "--html")
     viewed = Viewed.load(run, config)

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 from edge_se_sampler.bench.report import write_report
 from edge_se_sampler.bench.runner import new_result
-from edge_se_sampler.engine.files import make_folder, write_json
+from edge_se_sampler.engine.files import checksum, make_folder, write_json
 from edge_se_sampler.errors import check_value
 
 
@@ -32,9 +32,10 @@ class MicroBenchmark:
         for key, value in settings.items():
             check_value(key, value, not isinstance(value, int) or value >= 1, "at least 1")
         make_folder(self.output_dir, "--output-dir")
+        head = new_result("micro", settings)
         measured = import_module(f"edge_se_sampler.bench.micro.{self.name}").measure(**flags)
-        result = {**new_result("micro", settings), "benchmark": self.name, **measured}
-        write_json(self.output_dir / self.file_name.format(**settings), result)
+        result = {**head, "benchmark": self.name, **measured}
+        write_json(self.output_dir / self.file_name.format(**settings), result | {"checksum": checksum(result)})
         write_report(self.output_dir)
         print((self.output_dir / "README.md").read_text(encoding="utf-8"))
 

@@ -7,16 +7,14 @@ from typing import Any
 
 from edge_se_sampler.bench.micro.scoring import ERROR_SOURCES
 from edge_se_sampler.bench.report import describe_machine, fill_template, markdown_table
-from edge_se_sampler.bench.runner import check_texts
+from edge_se_sampler.bench.runner import read_measured
 from edge_se_sampler.data.scene_file import read_json
 
 
 def describe(folder: Path) -> str:
     """README.md of the benchmarks whose json lies in a folder."""
-    results = [read_json(path).object() for path in sorted(folder.glob("*.json"))]
-    results = [result for result in results if result.get("experiment") == "micro"]
-    for result in results:
-        check_texts(result)
+    paths = [path for path in sorted(folder.glob("*.json")) if read_json(path).object().get("experiment") == "micro"]
+    results = [read_measured(path) for path in paths]
     parts: dict[str, Any] = {result["benchmark"]: result for result in results}
     if "samplers" in parts:
         settings = parts["samplers"]["settings"]

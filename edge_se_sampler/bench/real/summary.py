@@ -55,7 +55,8 @@ def length_of(budget: str) -> tuple[bool, float]:
 
 
 def seconds_of(budget: str) -> float:
-    return float(budget.rstrip("smh")) * {"m": 60, "h": 3600}.get(budget[-1], 1)
+    number = budget.strip()
+    return float(number.rstrip("smh")) * {"m": 60, "h": 3600}.get(number[-1], 1)
 
 
 def psnr_by_budget(runs: list[Run]) -> dict[str, list[float]]:

@@ -6,7 +6,14 @@ import statistics
 from pathlib import Path
 
 from edge_se_sampler.bench.outcomes import FAILURE_RULE
-from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
+from edge_se_sampler.bench.report import (
+    decimals,
+    describe_command,
+    describe_errors,
+    fill_template,
+    markdown_table,
+    read_notes,
+)
 from edge_se_sampler.bench.runner import Run, read_result
 from edge_se_sampler.bench.strategies.claims import CLAIMS
 from edge_se_sampler.bench.strategies.figures import draw_differences
@@ -29,7 +36,7 @@ VERDICTS: dict[Verdict | None, str] = {
     "better": "better",
     "worse": "worse",
     "same": "not distinguishable",
-    None: "no verdict (one seed)",
+    None: "no verdict (too few seeds)",
 }
 """In words; the first that a strategy has anywhere says whether to use it."""
 ANSWERS: dict[Verdict | None, str] = {"better": "yes, ", "worse": "no, ", "same": "no need, ", None: ""}
@@ -56,7 +63,7 @@ def describe(folder: Path) -> str:
         claims=table_of_claims(runs),
         best=_table_of_best(runs),
         panels="\n\n".join(f"### {label}\n\n{_table_of(runs, panel)}" for panel, label in labels_of(runs).items()),
-        errors="\n".join(f"- {', '.join(map(str, error.values()))}" for error in result["errors"]),
+        errors=describe_errors(result),
         notes=read_notes(folder),
         reproduce=describe_command(result),
     )
@@ -146,7 +153,8 @@ def _describe_differences(runs: list[Run], strategy: str) -> str:
         ends = dict.fromkeys(_signed(value) for value in (min(differences), max(differences)))
         panels = panels_of(of_model)
         costs = [cost for panel in panels if (cost := cost_of_a_step(runs, panel, strategy)) is not None]
-        failures = sum(count_failures(runs, panel, strategy)[0] for panel in panels)
+        by_seconds = [run for run in of_model if run["plan"] == "seconds"]
+        failures = sum(count_failures(by_seconds, panel, strategy)[0] for panel in panels)
         text = f"{model} {' to '.join(ends)}"
         text += f", a step x{statistics.mean(costs):.2f}" if costs else ""
         parts.append(text + (f", {failures} failed" if failures else ""))
