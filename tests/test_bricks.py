@@ -41,6 +41,24 @@ def test_every_corner_of_an_occupied_cell_has_a_row_of_its_own() -> None:
     assert torch.equal(position[rows], expected)
 
 
+@pytest.mark.parametrize("share", [0.001, 0.02, 1.0])
+def test_a_brick_without_which_a_corner_is_missing_is_missed(share: float) -> None:
+    grid = grid_of(random_cells(share))
+    assert grid.has_all_corners()
+    found = []
+    for k in range(len(grid.bricks)):
+        kept = torch.arange(len(grid.bricks)) != k
+        state = grid.state_dict()
+        for name in ("bricks", "occupied", "sampled"):
+            state[name] = state[name][kept]
+        state["max_weight"] = state["max_weight"].view(-1, 64)[kept].reshape(-1)
+        fewer = BrickGrid.from_state(state)
+        rows = fewer.corner_rows(*torch.nonzero(fewer.occupied, as_tuple=True))
+        assert fewer.has_all_corners() == bool((rows >= 0).all())
+        found.append(fewer.has_all_corners())
+    assert not all(found)
+
+
 def test_no_brick_is_stored_that_has_neither_a_cell_nor_a_corner() -> None:
     cells = torch.zeros((40, 40, 40), dtype=torch.bool)
     cells[17, 18, 19] = True  # at the upper end of its brick along z alone

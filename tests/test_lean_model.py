@@ -83,6 +83,16 @@ def test_rays_begin_at_a_share_of_the_way_to_the_focus(share: float, expected: t
     torch.testing.assert_close(begin, torch.tensor(expected))
 
 
+@pytest.mark.parametrize("component", [0.0, -0.0, 1e-20, 1e-39])
+def test_rays_along_the_boxs_side_lie_in_it(component: float) -> None:
+    """However little they leave it."""
+    model = full_model()
+    ray = torch.tensor([[-1.0, 0.5, 3.0]]), torch.tensor([[component, 0.0, -1.0]])
+    rays = RayBundle(*ray, torch.zeros((1, 1), dtype=torch.int64), {"directions_norm": torch.ones(1, 1)})
+    spans = model._spans(rays, 1)
+    assert [float(x) * float(model.grid.cell_size) for x in (spans.begin, spans.end)] == pytest.approx([2.0, 4.0])
+
+
 @pytest.mark.parametrize("channels", [3, 4])
 def test_opacity_is_held_to_alpha_where_there_is_one(channels: int) -> None:
     model = full_model()

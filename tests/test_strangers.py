@@ -61,12 +61,23 @@ def set_weight(name: str, value: Any) -> Callable[[dict], None]:
     return lambda state: state["model"].update({name: value})
 
 
+def keep_a_brick(state: dict) -> None:
+    """Of a grid that is right otherwise: the first, all of its cells occupied, and weights of as many rows."""
+    weights = state["model"]
+    for name in ("bricks", "occupied", "sampled"):
+        weights[f"grid.{name}"] = weights[f"grid.{name}"][:1].clone()
+    weights["grid.occupied"].fill_(True)
+    for name in ("grid.max_weight", "density", "features"):
+        weights[name] = weights[name][:64].clone()
+
+
 STATES = {
     "a grid of 10^6 cells a side": set_weight("grid.size", torch.tensor([10**6] * 3)),
     "a grid of 2^62 cells a side": set_weight("grid.size", torch.tensor([2**62] * 3)),
     "a grid of no cells": set_weight("grid.size", torch.tensor([0, 4, 4])),
     "bricks outside of the box": lambda state: state["model"]["grid.bricks"].add_(10**5),
     "a brick twice": lambda state: state["model"]["grid.bricks"].copy_(state["model"]["grid.bricks"][0].clone()),
+    "cells whose corners are not stored": keep_a_brick,
     "samples in empty cells": lambda state: state["model"]["grid.sampled"].fill_(-1),
     "cells of size 0": lambda state: state["model"]["grid.cell_size"].zero_(),
     "sizes as floats": set_weight("grid.size", torch.tensor([4.0, 4.0, 4.0])),

@@ -99,7 +99,10 @@ def saved_grid(weights: Mapping[str, Tensor]) -> BrickGrid | None:
         return None
     try:
         check_grid(state)
-        return BrickGrid.from_state(state)
+        grid = BrickGrid.from_state(state)
+        if not grid.has_all_corners():
+            raise ValueError("corners of its cells are not stored")
+        return grid
     except (KeyError, ValueError) as problem:
         raise InputError(f"{OTHER_WEIGHTS} ({problem})") from problem
 

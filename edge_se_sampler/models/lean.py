@@ -184,7 +184,7 @@ class LeanModel(RayModel):
         # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid
         far = torch.where((of_pixels.abs() < MAX_SIZE).all(dim=1, keepdim=True), far, 0)
         origins = of_pixels[:, None].expand(-1, size, 3).reshape(-1, 3)  # copies nothing where a pixel has one ray
-        inverse = 1 / torch.where(directions == 0, 1e-12, directions)
+        inverse = 1 / torch.where(directions.abs() < 1e-12, 1e-12, directions)
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0).reshape(-1, size).maximum(near)
         end = torch.maximum(one, other).amin(dim=1).reshape(-1, size).minimum(far)

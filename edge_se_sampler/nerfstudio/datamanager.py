@@ -6,11 +6,14 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, fields
-from typing import Any
+from functools import cached_property
+from typing import Any, Generic, TypeVar, get_args
 
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils.misc import get_orig_class
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
@@ -20,9 +23,19 @@ from edge_se_sampler.sampling.pixel_sampler import build_scorer
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 from edge_se_sampler.sampling.settings import SamplingSettings
 
+Dataset = TypeVar("Dataset")
 
-class EdgeSEDataManager(VanillaDataManager):
-    """nerfstudio's data manager, its training sampler bound to the run. Evaluation keeps nerfstudio's own sampler."""
+
+class EdgeSEDataManager(VanillaDataManager[Dataset], Generic[Dataset]):
+    """nerfstudio's data manager, its training sampler bound to the run. Evaluation keeps nerfstudio's own sampler.
+
+    As with nerfstudio's, images are of a method's own dataset where that is the argument of the class."""
+
+    @cached_property
+    def dataset_type(self) -> type:
+        """The argument of the class, InputDataset by default: nerfstudio finds that of its own class alone."""
+        classes = (get_orig_class(self), *getattr(self, "__orig_bases__", ()))
+        return next((found for c in classes for found in get_args(c) if isinstance(found, type)), InputDataset)
 
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
         """The sampler of the training or the evaluation images; the config that both share stays as it is."""

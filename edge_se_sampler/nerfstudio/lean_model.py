@@ -21,7 +21,7 @@ from edge_se_sampler import protocol
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.engine.config import OptimizerConfig
 from edge_se_sampler.engine.optimizers import RowAdam, build_adam, learning_rate_factor, torch_groups
-from edge_se_sampler.engine.pipeline import analyze_views, resolve_depths, saved_grid
+from edge_se_sampler.engine.pipeline import OTHER_WEIGHTS, analyze_views, resolve_depths, saved_grid
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
@@ -160,8 +160,11 @@ class LeanNerfModel(Model):
             self.field.grid = grid.to(self.device)
             for name in ("density", "features"):
                 parameter = getattr(self.field, name)
-                parameter.data = torch.empty_like(weights[name], device=self.device)
-        result = super().load_state_dict(state_dict, strict, assign)
+                parameter.data = parameter.data.new_empty((grid.num_rows, parameter.shape[1]), device=self.device)
+        try:
+            result = super().load_state_dict(state_dict, strict, assign)
+        except RuntimeError as problem:
+            raise InputError(OTHER_WEIGHTS) from problem
         near, far = self.depths.tolist()
         self.field.config = replace(self.field.config, near=near, far=far)
         return result
@@ -172,6 +175,7 @@ def _check(trainer: Any) -> None:
     config = trainer.config
     flags = {
         "mixed-precision True": config.mixed_precision,
+        "use-grad-scaler True": config.use_grad_scaler,
         "gradient-accumulation-steps": any(steps > 1 for steps in config.gradient_accumulation_steps.values()),
         "machine.num-devices above 1": trainer.world_size > 1,
     }

@@ -32,6 +32,7 @@ class TrainingImages(InputDataset):
 
     def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0) -> None:
         super().__init__(replace(dataparser_outputs, alpha_color=None), scale_factor)
+        self.mask_color = None  # it would be painted where nothing is trained on
         self._lenses = _read_lenses(self.cameras)
         sizes = zip(self.cameras.width.flatten().tolist(), self.cameras.height.flatten().tolist(), strict=True)
         pinholes = [find_pinhole(camera, *size) for camera, size in zip(self._lenses, sizes, strict=True)]

@@ -240,6 +240,15 @@ class BrickGrid(nn.Module):
         brick = torch.gather(self.neighbors[bricks].long(), 1, neighbor)
         return torch.where(brick < 0, -1, 64 * brick + corner)
 
+    def has_all_corners(self) -> bool:
+        """Whether the corners of all occupied cells are stored, without which compiled kernels must not be called."""
+        cells = self.occupied.unflatten(1, (BRICK,) * 3)
+        for upper, neighbor in zip(OFFSETS.tolist(), self.neighbors.unbind(dim=1), strict=True):
+            x, y, z = (slice(-1, None) if is_upper else slice(None) for is_upper in upper)
+            if (cells[:, x, y, z].flatten(1).any(dim=1) & (neighbor < 0)).any():
+                return False
+        return True
+
     def find_corners(self, cells: Tensor) -> Tensor:
         """(64 K,) bool: the rows of corners of those of the occupied cells, (K, 64) bool."""
         found = torch.zeros(self.num_rows, dtype=torch.bool, device=cells.device)

@@ -22,11 +22,12 @@ from full_host import RAYS, config_of, trainer_of, watch  # noqa: E402
 from nerfstudio.configs.method_configs import all_methods  # noqa: E402
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig  # noqa: E402
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: E402
+from nerfstudio.data.datasets.base_dataset import InputDataset  # noqa: E402
 from nerfstudio.data.pixel_samplers import PairPixelSamplerConfig, PatchPixelSampler, PixelSampler  # noqa: E402
 
 from edge_se_sampler.errors import InputError  # noqa: E402
-from edge_se_sampler.nerfstudio.datamanager import attach  # noqa: E402
-from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSamplerConfig  # noqa: E402
+from edge_se_sampler.nerfstudio.datamanager import EdgeSEDataManager, attach  # noqa: E402
+from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig  # noqa: E402
 
 SIZES = [(32, 32), (20, 30), (31, 17), (32, 24), (9, 32), (25, 25)]
 
@@ -145,6 +146,25 @@ def test_a_stock_method_trains_on_important_pixels(host_scene: Path, tmp_path: P
     ours.train()
     for (*_, attached), (*_, by_config) in zip(seen, drawn, strict=True):
         assert torch.equal(attached, by_config)
+
+
+def test_a_methods_own_dataset_stays(host_scene: Path, tmp_path: Path) -> None:
+    class Depths(InputDataset):
+        """Stands for one that has more than images."""
+
+    class Manager(EdgeSEDataManager[Depths]):
+        pass
+
+    for target, expected in (
+        (EdgeSEDataManager, InputDataset),
+        (EdgeSEDataManager[Depths], Depths),
+        (Manager, Depths),
+    ):
+        config = config_of("edge-se-nerf", host_scene, tmp_path)
+        config.pipeline.datamanager._target = target
+        manager = trainer_of(config).pipeline.datamanager
+        assert [type(dataset) for dataset in (manager.train_dataset, manager.eval_dataset)] == [expected] * 2
+        assert isinstance(manager.train_pixel_sampler, EdgeSEPixelSampler)
 
 
 def test_attaching_where_pixels_are_drawn_by_others_is_refused(host_scene: Path, tmp_path: Path) -> None:

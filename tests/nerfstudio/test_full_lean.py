@@ -129,6 +129,15 @@ def test_a_checkpoint_renders_what_was_trained(test_mode: Any, trained: Any) -> 
         assert psnr_of(pipeline) == pytest.approx(psnr_of(trained.pipeline), abs=1e-3)
 
 
+@pytest.mark.parametrize("name", ["density", "features"])
+def test_weights_of_other_cells_are_refused(name: str, trained: Any) -> None:
+    _, pipeline, *_ = eval_setup(trained.base_dir / "config.yml", test_mode="inference")
+    weights = dict(pipeline.model.state_dict())
+    pipeline.model.load_state_dict(weights)
+    with pytest.raises(InputError, match="not this model's"):
+        pipeline.model.load_state_dict(weights | {f"field.{name}": weights[f"field.{name}"][:10, :3]})
+
+
 def test_renders_and_exports_leave_the_background_out(trained: Any, scene: Path, tmp_path: Path) -> None:
     """nerfstudio's own commands: a view's transparency, and points on the object alone."""
     for needed in ("open3d", "pymeshlab", "xatlas"):
@@ -225,6 +234,14 @@ def test_masks_of_the_data_hold(mixed: bool, host_scene: Path, tmp_path: Path) -
     assert all(masks[number][row, column] for number, row, column in drawn.tolist())
 
 
+def test_what_is_masked_is_not_painted(host_scene: Path, tmp_path: Path) -> None:
+    """As nerfstudio's own images are, with numbers in [0, 1] among bytes."""
+    config = lean_config(nerfstudio_folder(tmp_path, host_scene, mixed=False, masked=True, channels=3), tmp_path)
+    parser = NerfstudioDataParserConfig(train_split_fraction=0.8, mask_color=(1.0, 1.0, 1.0))
+    config.pipeline.datamanager.dataparser = parser
+    train(trainer_of(config), 2)
+
+
 def test_a_pixels_rays_are_spread_as_far_as_its_quarters(scene: Path, tmp_path: Path) -> None:
     """If maybe at another angle; so their mean is the same but for third derivatives. What is no camera's has no
     extent."""
@@ -286,6 +303,7 @@ def test_what_it_cannot_do_is_refused(scene: Path, tmp_path: Path) -> None:
 
     model = fresh.pipeline.model.lean
     refused("--mixed-precision", mixed_precision=True)
+    refused("--use-grad-scaler", use_grad_scaler=True)
     refused("--gradient-accumulation-steps", gradient_accumulation_steps={"fields": 2})
     refused("pipeline.model.size", pipeline__model__lean=override(model, {"size": "tiny"}))
     refused("background-color", pipeline__model__lean=override(model, {"background_color": "random"}))
