@@ -249,7 +249,8 @@ def test_the_command_writes_a_report_and_goes_on(data: Path, tmp_path: Path, edg
     result = json.loads((out / "result.json").read_text())
     assert [run["variant"] for run in result["runs"]] == ["lean", "random"]
     assert result["errors"] == []
-    assert result["settings"] == {"seconds": 2, "threads": 1, "image_size": 24}
+    assert result["settings"] == {"seconds": 2, "threads": 1, "image_size": 24, "data": data.parent.name}
+    assert f"the scenes in {data.parent.name}" in (out / "README.md").read_text()
     answer = edge_se("bench", "chart", *options, "--variants", "lean", "--dry-run")
     assert answer.out.splitlines() == ["lean | mic | 0", "1 trainings, 0 of them pending"]
 
@@ -269,6 +270,18 @@ def test_bad_flags_are_refused(data: Path, tmp_path: Path, edge_se: Any) -> None
         assert answer.code == 2, (options, answer)
         assert message in answer.err
     assert not (tmp_path / "o").exists()
+
+
+def test_results_on_synthetic_scenes_go_on_and_are_not_those_of_a_folder(tmp_path: Path, edge_se: Any) -> None:
+    """Of the same names, and images as large; versions before had no setting for that."""
+    make_scenes(tmp_path / "own", ["mic"], size=100, num_train=1, num_val=1, num_test=1)
+    folder = folder_of(tmp_path, [{"variant": "lean", "scene": "mic", "seed": 0}])
+    flags = ["--output-dir", folder, "--scenes", "mic", "--seeds", 0, "--variants", "lean", "--dry-run"]
+    answer = edge_se("bench", "chart", *flags)
+    assert "1 trainings, 0 of them pending" in answer.out
+    answer = edge_se("bench", "chart", *flags, "--data", tmp_path / "own")
+    assert answer.code == 2, answer
+    assert "other settings" in answer.err
 
 
 def test_baselines_that_cannot_be_compared_are_refused_before_training(tmp_path: Path, edge_se: Any) -> None:

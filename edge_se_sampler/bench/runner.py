@@ -19,7 +19,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -124,10 +124,7 @@ def _find_trials(experiment: Experiment, runs: list[Run]) -> list[Any]:
     trials = list(dict.fromkeys(experiment.trials(runs)))
     if not trials:
         raise InputError(f"bench {experiment.name}: there is no training of what the flags choose; choose more")
-    try:
-        check_plain(json.loads(json.dumps([asdict(entry) for entry in (experiment.settings, *trials)])))
-    except ValueError as problem:
-        raise InputError(f"bench {experiment.name}: {problem}, which a page could not show; rename it") from problem
+    _refuse_marks(experiment.name, json.loads(json.dumps([asdict(trial) for trial in trials])))
     return trials
 
 
@@ -162,11 +159,15 @@ def _check_runs(experiment: Experiment, result: dict[str, Any], path: Path) -> N
 
 def load_or_create(path: Path, experiment: str, settings: Any) -> dict[str, Any]:
     """The result of an earlier call with the same settings (a dataclass), or an empty one; InputError if the file is no
-    result, or one of another version, experiment or settings."""
+    result, or one of another version, experiment or settings, or a page could not show these."""
+    defaults = {setting.name: setting.default for setting in fields(settings) if setting.default is not MISSING}
     settings = json.loads(json.dumps(asdict(settings)))
+    _refuse_marks(experiment, settings)
     if not path.exists():
         return new_result(experiment, settings) | {"errors": [], "runs": []}
     result = read_result(path)
+    # what earlier versions had no setting for was as it is by default
+    result["settings"] = {**{k: v for k, v in defaults.items() if isinstance(v, str)}, **result["settings"]}
     if (result["experiment"], result["settings"]) != (experiment, settings):
         raise InputError(f"{path}: of another experiment or other settings; name another --output-dir, or move it away")
     result["command"] = "\n".join(dict.fromkeys([*result["command"].splitlines(), _command()]))
@@ -177,6 +178,14 @@ def new_result(experiment: str, settings: dict[str, Any]) -> dict[str, Any]:
     """What every json of results begins with; command: those that have trained it, one a line."""
     head = {"version": VERSION, "experiment": experiment, "command": _command()}
     return {**head, "settings": settings, "machine": machine()}
+
+
+def _refuse_marks(experiment: str, value: Any) -> None:
+    """InputError if a page could not show a text in an experiment's settings or trials."""
+    try:
+        check_plain(value)
+    except ValueError as problem:
+        raise InputError(f"bench {experiment}: {problem}, which a page could not show; rename it") from problem
 
 
 def _command() -> str:

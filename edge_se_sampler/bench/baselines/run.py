@@ -53,7 +53,7 @@ class BaselineSettings(ChartSettings):
         return f"{self.program}, {self.label}" if self.label else self.program
 
 
-def read_baselines(folder: Path, **expected: int) -> dict[str, dict[str, Any]]:
+def read_baselines(folder: Path, **expected: int | str) -> dict[str, dict[str, Any]]:
     """Name and version -> result of the baselines beside a result, in the order of their file names. InputError: a file
     cannot be read, or has other settings than are expected, such as threads or image_size."""
     baselines = {}
@@ -66,8 +66,8 @@ def read_baselines(folder: Path, **expected: int) -> dict[str, dict[str, Any]]:
         for key, value in expected.items():
             if getattr(found, key) != value:
                 raise InputError(
-                    f"{path}: {key} is {getattr(found, key)}, that of the result beside it {value}: "
-                    "seconds cannot be compared"
+                    f"{path}: {key} is {getattr(found, key)!r}, that of the result beside it {value!r}: "
+                    "they cannot be compared"
                 )
         baselines[f"{found.name} ({found.program_version})"] = result
     return baselines

@@ -49,7 +49,7 @@ class ChartOptions:
         if len(set(sizes.values())) > 1:
             listed = ", ".join(f"{scene} {size}" for scene, size in sizes.items())
             raise InputError(f"--data {self.data}: scenes of different sizes ({listed} pixels): chart them separately")
-        return ChartSettings(self.seconds, self.threads, sizes[self.scenes[0]])
+        return ChartSettings(self.seconds, self.threads, sizes[self.scenes[0]], self.data.resolve().name)
 
     def image_size(self, scene: str) -> int:
         """The longer side of a scene's first image, pixels."""
@@ -82,7 +82,7 @@ class BenchChart(ChartOptions, ExperimentCommand):
         check_known("variants", self.variants, VARIANTS)
         settings = self.settings()
         # refuses, before anything is trained, those that cannot be compared
-        read_baselines(self.output_dir, threads=settings.threads, image_size=settings.image_size)
+        read_baselines(self.output_dir, threads=settings.threads, image_size=settings.image_size, data=settings.data)
         # seed by seed and scene by scene, so that what is compared is trained side by side
         keys = product(self.seeds, self.scenes, self.variants or VARIANTS)
         trials = [Trial(variant, scene, seed) for seed, scene, variant in keys]

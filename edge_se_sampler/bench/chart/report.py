@@ -45,6 +45,7 @@ def describe(folder: Path) -> str:
         **result["settings"],
         **groups,
         unit=settings.unit,
+        source=settings.source,
         number=len(runs),
         seeds=len({run["seed"] for run in runs}),
         variant=", ".join(VARIANTS[name].full_label for name in variants),
@@ -66,7 +67,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], Baselines, Iterable[dict[str, A
     """The result, the baselines' runs, and their results."""
     result = read_result(folder / "result.json")
     settings = ChartSettings(**result["settings"])
-    baselines = read_baselines(folder, threads=settings.threads, image_size=settings.image_size)
+    baselines = read_baselines(folder, threads=settings.threads, image_size=settings.image_size, data=settings.data)
     return result, {label: baseline["runs"] for label, baseline in baselines.items()}, baselines.values()
 
 

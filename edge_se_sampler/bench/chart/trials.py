@@ -55,10 +55,19 @@ class ChartSettings:
     threads: int = 1
     image_size: int = 100
     """Longer side of the images, pixels."""
+    data: str = ""
+    """Name of the folder of scenes; none: synthetic ones."""
 
     @property
     def clock(self) -> Callable[[], float]:
         return time.process_time if self.threads == 1 else time.perf_counter
+
+    @property
+    def source(self) -> str:
+        """Where the scenes are from, in words."""
+        if self.data:
+            return f"the scenes in {self.data}"
+        return "simple synthetic scenes that share only their names with NeRF-synthetic's"
 
     @property
     def unit(self) -> str:
