@@ -18,7 +18,8 @@ from edge_se_sampler.bench.chart.report import describe, draw, tables
 from edge_se_sampler.bench.chart.summary import by_variant, comparable, mean_psnr_at, psnr_at, runs_on
 from edge_se_sampler.bench.chart.trials import ChartSettings, Trial, config_of, iterations_within, train_and_evaluate
 from edge_se_sampler.bench.chart.variants import VARIANTS
-from edge_se_sampler.bench.runner import run_in_subprocess, write_result
+from edge_se_sampler.bench.results import write_result
+from edge_se_sampler.bench.runner import run_in_subprocess
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.engine.session import resolve_config

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.nerfstudio.report import describe
-from edge_se_sampler.bench.runner import write_result
+from edge_se_sampler.bench.results import write_result
 
 
 def run(method: str, seed: int, psnr: float, outcome: str) -> dict[str, Any]:

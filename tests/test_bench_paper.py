@@ -13,7 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench import command, runner
+from edge_se_sampler.bench import command, results, runner
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import LABELS, SCENES, published
 from edge_se_sampler.bench.paper.report import describe, psnr_table
@@ -203,8 +203,8 @@ def test_the_page_says_where_real_scenes_disagree(tmp_path: Path) -> None:
             for strategy in ("vanilla-nerf", "se-nerf")
             for seed in range(5)
         ]
-        result = runner.new_result("paper", asdict(Settings())) | {"errors": [], "runs": runs}
-        runner.write_result(tmp_path / "result.json", result)
+        result = results.new_result("paper", asdict(Settings())) | {"errors": [], "runs": runs}
+        results.write_result(tmp_path / "result.json", result)
         page = describe(tmp_path)
         line = "- SE raises PSNR whatever the early phase, at equal steps: supported on the synthetic scenes, not "
         assert (line in page) == disagree

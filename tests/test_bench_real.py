@@ -18,7 +18,7 @@ from edge_se_sampler.bench.real.published import PUBLISHED
 from edge_se_sampler.bench.real.report import describe, draw
 from edge_se_sampler.bench.real.summary import seconds_of
 from edge_se_sampler.bench.real.trials import MEMBERS, VARIANTS, Settings, Trial, run_trial, training_length
-from edge_se_sampler.bench.runner import new_result, write_result
+from edge_se_sampler.bench.results import new_result, write_result
 from edge_se_sampler.data.synthetic.folder import make_scenes
 from edge_se_sampler.errors import InputError
 

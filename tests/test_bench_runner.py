@@ -20,17 +20,14 @@ import pytest
 
 from edge_se_sampler.bench import runner
 from edge_se_sampler.bench.command import ExperimentCommand
+from edge_se_sampler.bench.results import VERSION, Run, read_result, write_result
 from edge_se_sampler.bench.runner import (
-    VERSION,
     Experiment,
-    Run,
     Shard,
     executor_factory,
     list_trials,
-    read_result,
     run_experiment,
     run_in_subprocess,
-    write_result,
 )
 from edge_se_sampler.errors import InputError
 

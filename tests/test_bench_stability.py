@@ -15,7 +15,7 @@ import torch
 
 from edge_se_sampler.bench import command
 from edge_se_sampler.bench.outcomes import Outcome
-from edge_se_sampler.bench.runner import new_result, write_result
+from edge_se_sampler.bench.results import new_result, write_result
 from edge_se_sampler.bench.stability import report, scenes
 from edge_se_sampler.bench.stability import train as train_module
 from edge_se_sampler.bench.stability.scenes import COLORS, background_of, read_real_splits, render_splits

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_se_sampler.bench.runner import new_result, write_result
+from edge_se_sampler.bench.results import new_result, write_result
 from edge_se_sampler.bench.strategies.claims import CLAIMS
 from edge_se_sampler.bench.strategies.command import BenchStrategies
 from edge_se_sampler.bench.strategies.report import describe, describe_use, draw, table_of_claims, tables

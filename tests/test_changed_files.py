@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from tiny import SMALL, copy_run
 
-from edge_se_sampler.bench.runner import new_result, read_result, write_result
+from edge_se_sampler.bench.results import new_result, read_result, write_result
 from edge_se_sampler.cli import main
 from edge_se_sampler.engine.checkpoint import DamagedCheckpoint, latest_checkpoint, load_checkpoint, load_latest
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest

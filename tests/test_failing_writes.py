@@ -20,7 +20,8 @@ from killable import toy_experiment
 from test_killed import flat, metrics_of, state_of
 from tiny import SMALL
 
-from edge_se_sampler.bench.runner import read_result, run_experiment
+from edge_se_sampler.bench.results import read_result
+from edge_se_sampler.bench.runner import run_experiment
 from edge_se_sampler.engine.run_folder import EventWriter
 from edge_se_sampler.errors import InputError
 

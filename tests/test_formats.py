@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from format_runs import RUNS, SETTINGS, STEPS, write_scene
 
-from edge_se_sampler.bench.runner import VERSION, read_result, write_result
+from edge_se_sampler.bench.results import VERSION, read_result, write_result
 from edge_se_sampler.engine.run_folder import FORMAT, OLDEST_FORMAT, RunFolder
 from edge_se_sampler.methods import method_configs
 

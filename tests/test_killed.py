@@ -16,7 +16,7 @@ import torch
 from killable import KillableCommands
 from tiny import SMALL
 
-from edge_se_sampler.bench.runner import read_result
+from edge_se_sampler.bench.results import read_result
 from edge_se_sampler.engine.checkpoint import load_latest
 from edge_se_sampler.engine.run_folder import RunFolder, config_digest
 from edge_se_sampler.methods import method_configs

@@ -21,7 +21,7 @@ from blender_folder import chunk, png
 from capture_folder import NAMES, write_colmap, write_images, write_transforms
 from strangers import change_config, change_state, contents, memory_bound, replace_payload
 
-from edge_se_sampler.bench.runner import write_result
+from edge_se_sampler.bench.results import write_result
 from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint
 
 BOUND = 2**30

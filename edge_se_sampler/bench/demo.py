@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.report import describe_machine
-from edge_se_sampler.bench.runner import new_result
+from edge_se_sampler.bench.results import new_result
 from edge_se_sampler.bench.train import cached_scene
 from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.evaluation import evaluate

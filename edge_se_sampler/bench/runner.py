@@ -2,8 +2,6 @@
 
 trial   what identifies a training: a frozen dataclass of plain values
 run     a trial's fields and what was measured
-
-Free of torch until a result is created.
 """
 
 from __future__ import annotations
@@ -12,32 +10,25 @@ import json
 import multiprocessing
 import os
 import re
-import shlex
 import signal
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.bench.machine import machine
-from edge_se_sampler.data.scene_file import quote, read_json
-from edge_se_sampler.engine.files import checksum, make_folder, write_atomically
+from edge_se_sampler.bench.results import Run, load_or_create, refuse_marks, write_result
+from edge_se_sampler.data.scene_file import quote
+from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.interrupts import interrupts_blocked, interrupts_delayed
 
-VERSION = 3
-"""Of results. Version 2, which is read as well, has no checksum."""
-PLAIN = re.compile(r"[\w .,:;=+/()%'\"~@-]*")
-"""Texts without marks of Markdown and HTML."""
 MAX_BROKEN_POOLS = 3
 """A pool of processes breaks when one of them is killed; so many pools are started before giving up."""
 
-Run = dict[str, Any]
 ExecutorFactory = Callable[[], Executor]
 
 
@@ -124,7 +115,7 @@ def _find_trials(experiment: Experiment, runs: list[Run]) -> list[Any]:
     trials = list(dict.fromkeys(experiment.trials(runs)))
     if not trials:
         raise InputError(f"bench {experiment.name}: there is no training of what the flags choose; choose more")
-    _refuse_marks(experiment.name, json.loads(json.dumps([asdict(trial) for trial in trials])))
+    refuse_marks(experiment.name, json.loads(json.dumps([asdict(trial) for trial in trials])))
     return trials
 
 
@@ -155,107 +146,6 @@ def _check_runs(experiment: Experiment, result: dict[str, Any], path: Path) -> N
         sorted({tuple(run[name] for name in names) for run in [*trials, *result["runs"], *result["errors"]]})
     except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as problem:
         raise InputError(f"{path}: its runs are none of bench {experiment.name} ({quote(problem)})") from problem
-
-
-def load_or_create(path: Path, experiment: str, settings: Any) -> dict[str, Any]:
-    """The result of an earlier call with the same settings (a dataclass), or an empty one; InputError if the file is no
-    result, or one of another version, experiment or settings, or a page could not show these."""
-    defaults = {setting.name: setting.default for setting in fields(settings) if setting.default is not MISSING}
-    settings = json.loads(json.dumps(asdict(settings)))
-    _refuse_marks(experiment, settings)
-    if not path.exists():
-        return new_result(experiment, settings) | {"errors": [], "runs": []}
-    result = read_result(path)
-    # what earlier versions had no setting for was as it is by default
-    result["settings"] = {**{k: v for k, v in defaults.items() if isinstance(v, str)}, **result["settings"]}
-    if (result["experiment"], result["settings"]) != (experiment, settings):
-        raise InputError(f"{path}: of another experiment or other settings; name another --output-dir, or move it away")
-    result["command"] = "\n".join(dict.fromkeys([*result["command"].splitlines(), _command()]))
-    return result
-
-
-def new_result(experiment: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """What every json of results begins with; command: those that have trained it, one a line."""
-    head = {"version": VERSION, "experiment": experiment, "command": _command()}
-    return {**head, "settings": settings, "machine": machine()}
-
-
-def _refuse_marks(experiment: str, value: Any) -> None:
-    """InputError if a page could not show a text in an experiment's settings or trials."""
-    try:
-        check_plain(value)
-    except ValueError as problem:
-        raise InputError(f"bench {experiment}: {problem}, which a page could not show; rename it") from problem
-
-
-def _command() -> str:
-    """The command line; InputError if a page could not show it."""
-    command = shlex.join(["edge-se", *sys.argv[1:]])
-    try:
-        _check_command(command)
-    except ValueError as problem:
-        raise InputError(f"{problem}, which a page could not show; rename it") from problem
-    return command
-
-
-def read_result(path: Path) -> dict[str, Any]:
-    """A result.json; InputError as `read_measured`, or if it has no runs and errors."""
-    result = read_measured(path)
-    entries = (result.get("runs"), result.get("errors"))
-    if not all(isinstance(e, list) and all(isinstance(entry, dict) for entry in e) for e in entries):
-        raise InputError(f"{path}: not a result of edge-se bench (runs and errors are lists of objects)")
-    return result
-
-
-def read_measured(path: Path) -> dict[str, Any]:
-    """A json of results, of trainings or others; InputError if it cannot be read, is none of this version or the one
-    before, or is not as it was written."""
-    result = read_json(path).object()
-    claimed = result.pop("checksum", None)
-    try:
-        if result["version"] not in (2, VERSION):
-            raise ValueError(f"version {result['version']}, not {VERSION}")
-        if claimed != (None if result["version"] == 2 else checksum(result)):
-            raise ValueError("changed since it was written (checksum)")
-        if not {"experiment", "command", "settings", "machine"} <= result.keys():
-            raise KeyError("experiment, command, settings or machine")
-        check_texts(result)
-    except (ValueError, KeyError, TypeError, RecursionError) as problem:
-        raise InputError(f"{path}: not a result of edge-se bench ({quote(problem)})") from problem
-    return result
-
-
-def check_texts(result: dict[str, Any]) -> None:
-    """ValueError or TypeError if a result's texts could be more than that in a page, see `check_plain`."""
-    check_plain({key: value for key, value in result.items() if key not in ("errors", "command")})
-    _check_command(str(result["command"]).replace("\n", ""))
-
-
-def _check_command(command: str) -> None:
-    """ValueError if a command line could be more than that between a page's backticks."""
-    if "`" in command or not command.isprintable():
-        raise ValueError(f"a command with a backtick, or no text: {quote(command)}")
-
-
-def check_plain(value: Any) -> None:
-    """ValueError if a text in a json value could be more than text in a page or the name of a file: HTML, a link, a
-    path that leads out."""
-    if isinstance(value, dict):
-        check_plain([*value, *value.values()])
-    elif isinstance(value, list):
-        for item in value:
-            check_plain(item)
-    elif isinstance(value, str) and (".." in value or not PLAIN.fullmatch(value)):
-        raise ValueError(f"a text with marks: {quote(value)}")
-
-
-def write_result(path: Path, result: dict[str, Any]) -> None:
-    """result.json, every run on a line of its own; InputError if it cannot be written."""
-    result = {**result, "version": VERSION}
-    head = {key: value for key, value in result.items() if key != "runs"} | {"checksum": checksum(result)}
-    head = json.dumps(head, indent=1, allow_nan=False)
-    runs = ",\n".join(json.dumps(run, allow_nan=False) for run in result["runs"])
-    write_atomically(path, f'{head[:-2]},\n "runs": [\n{runs}\n ]\n}}\n'.encode())
 
 
 def pending(trials: Sequence[Any], result: dict[str, Any]) -> list[Any]:

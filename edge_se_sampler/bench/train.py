@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.outcomes import measure_outcome
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.data.new_folder import unless_made_meanwhile
 from edge_se_sampler.data.offcenter import offcenter
 from edge_se_sampler.data.synthetic.folder import make_scenes

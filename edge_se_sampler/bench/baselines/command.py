@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from edge_se_sampler.bench.chart.command import ChartOptions
-from edge_se_sampler.bench.runner import load_or_create, run_in_subprocess, write_result
+from edge_se_sampler.bench.results import load_or_create, write_result
+from edge_se_sampler.bench.runner import run_in_subprocess
 from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.errors import InputError, check_value
 

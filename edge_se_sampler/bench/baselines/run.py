@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.chart.trials import ChartSettings
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.data.dataset import read_split
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import Picture, to_pictures

@@ -11,7 +11,7 @@ from edge_se_sampler.bench.chart.summary import by_variant, comparable, mean_psn
 from edge_se_sampler.bench.chart.trials import EVAL_SECONDS, ChartSettings
 from edge_se_sampler.bench.chart.variants import RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import failed
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.engine.figures import require_pyplot, style_axes
 
 

@@ -15,7 +15,7 @@ from edge_se_sampler.bench.chart.trials import ChartSettings
 from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, TOP, VARIANTS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.engine.figures import save_figure
 
 COLUMNS = {3: "3 s", 7: "7 s", 20: "20 s", 60: "60 s", END: "end"}  # moments -> heads, if trainings are so long

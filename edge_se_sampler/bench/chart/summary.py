@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from edge_se_sampler.bench.chart.variants import GROUPS, RECOMMENDED, VARIANTS
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 
 END = float("inf")
 """The moment at which every training has ended."""

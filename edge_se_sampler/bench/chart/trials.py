@@ -24,7 +24,7 @@ import torch
 from edge_se_sampler.bench.chart.variants import VARIANTS
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.outcomes import measure_outcome
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.engine.config import TrainerConfig, override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.metrics import composite_on, psnr

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from edge_se_sampler.bench.report import write_report
-from edge_se_sampler.bench.runner import new_result
+from edge_se_sampler.bench.results import new_result
 from edge_se_sampler.engine.files import checksum, make_folder, write_json
 from edge_se_sampler.errors import check_value
 

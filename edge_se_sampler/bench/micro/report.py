@@ -7,7 +7,7 @@ from typing import Any
 
 from edge_se_sampler.bench.micro.scoring import ERROR_SOURCES
 from edge_se_sampler.bench.report import describe_machine, fill_template, markdown_table
-from edge_se_sampler.bench.runner import read_measured
+from edge_se_sampler.bench.results import read_measured
 from edge_se_sampler.data.scene_file import read_json
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from edge_se_sampler.bench.nerfstudio.train import METHODS
 from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table
-from edge_se_sampler.bench.runner import read_result
+from edge_se_sampler.bench.results import read_result
 
 
 def describe(folder: Path) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.paper.published import LABELS, REAL_SCENES, SCENES
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, TABLES, Trial, runs_by_trial
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.sampling.edges import unit_float

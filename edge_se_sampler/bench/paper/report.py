@@ -12,7 +12,7 @@ from edge_se_sampler.bench.paper.published import LABELS, REAL_SCENES, SCENES, p
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, REAL_DOWNSCALE, TABLES
 from edge_se_sampler.bench.paper.verdicts import MIN_DIFFERENCE, ClaimVerdict, evaluate_claims
 from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table, read_notes
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.bench.statistics import format_difference
 
 OTHER_CURES = {

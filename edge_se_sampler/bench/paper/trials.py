@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge_se_sampler.bench.paper.published import LABELS, REAL_SCENES, SCENES
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.train import cached_scene, offcenter_copies, train_and_measure
 from edge_se_sampler.data.blender import read_blender
 from edge_se_sampler.data.frames import LoadSettings

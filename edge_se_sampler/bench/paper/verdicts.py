@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 from edge_se_sampler.bench.outcomes import failed
 from edge_se_sampler.bench.paper.published import LABELS
 from edge_se_sampler.bench.paper.trials import PAPER_TABLES, Trial, runs_by_trial
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.statistics import PairedDifference, paired_difference
 
 MIN_SEEDS = 3

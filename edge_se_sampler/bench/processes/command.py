@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from edge_se_sampler.bench.report import write_report
-from edge_se_sampler.bench.runner import new_result, write_result
+from edge_se_sampler.bench.results import new_result, write_result
 from edge_se_sampler.engine.files import make_folder
 from edge_se_sampler.errors import check_value
 from edge_se_sampler.models.config import MAX_RAYS

@@ -8,7 +8,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from edge_se_sampler.bench.report import describe_machine, fill_template, markdown_table
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 
 MARGIN = 0.05
 """Share of a step's time that several processes must save to pay: less is within the noise."""

@@ -18,7 +18,8 @@ from torch.distributed import TCPStore  # pyright: ignore[reportPrivateImportUsa
 
 from edge_se_sampler import ranks
 from edge_se_sampler.bench.machine import median_milliseconds
-from edge_se_sampler.bench.runner import Run, initialize_worker
+from edge_se_sampler.bench.results import Run
+from edge_se_sampler.bench.runner import initialize_worker
 from edge_se_sampler.bench.train import cached_scene
 from edge_se_sampler.engine.config import MANAGER, override
 from edge_se_sampler.engine.session import prepare

@@ -22,7 +22,7 @@ from edge_se_sampler.bench.real.summary import (
     psnr_by_budget,
     seconds_of,
 )
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.engine.figures import require_pyplot, style_axes
 
 TICKS = {10: "10 s", 60: "1 min", 180: "3 min", 600: "10 min", 3600: "1 h", 86400: "1 d"}

@@ -34,7 +34,7 @@ from edge_se_sampler.bench.report import (
     read_notes,
     read_title,
 )
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.engine.figures import save_figure
 
 Key = tuple[str, str]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edge_se_sampler.bench.real.published import PIXELS
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 
 BASELINE, UNIFORM, WITHOUT_MASKS = "lean-nerf", "uniform pixels", "no hull"
 """Variants: the one that others are compared with, that without edges, and the one that knows no masks in advance."""

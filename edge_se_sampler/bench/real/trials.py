@@ -15,7 +15,8 @@ import torch
 from edge_se_sampler.bench.chart.variants import UNIFORM_PIXELS
 from edge_se_sampler.bench.machine import resident_memory
 from edge_se_sampler.bench.real.summary import STEPS, is_time
-from edge_se_sampler.bench.runner import Run, run_in_subprocess
+from edge_se_sampler.bench.results import Run
+from edge_se_sampler.bench.runner import run_in_subprocess
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
 from edge_se_sampler.data.scene_file import quote

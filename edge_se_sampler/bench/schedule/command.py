@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from edge_se_sampler.bench.command import ExperimentCommand
-from edge_se_sampler.bench.runner import Experiment, Run
+from edge_se_sampler.bench.results import Run
+from edge_se_sampler.bench.runner import Experiment
 from edge_se_sampler.errors import InputError
 
 

@@ -12,7 +12,7 @@ from edge_se_sampler.bench.outcomes import FAILURE_RULE, failed
 from edge_se_sampler.bench.paper.published import SCENES
 from edge_se_sampler.bench.paper.trials import TABLES
 from edge_se_sampler.bench.report import decimals, describe_command, fill_template, markdown_table
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.bench.schedule.trials import CONFIGURATIONS, SHARES, best_share, psnrs_by_trial, score_shares
 from edge_se_sampler.bench.statistics import PairedDifference, format_difference, paired_difference, wilson_interval
 

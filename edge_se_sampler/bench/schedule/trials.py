@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from edge_se_sampler.bench.paper import trials as paper
 from edge_se_sampler.bench.paper.published import SCENES
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.train import train_and_measure
 from edge_se_sampler.engine.config import SAMPLER, TrainerConfig, override
 

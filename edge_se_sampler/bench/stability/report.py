@@ -9,7 +9,7 @@ from typing import Any
 
 from edge_se_sampler.bench.outcomes import COLLAPSED_SHARE, MIN_GAIN
 from edge_se_sampler.bench.report import describe_command, fill_template, markdown_table, read_notes
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.bench.stability.settings import REAL_SETTINGS, SETTINGS, STRATEGIES
 from edge_se_sampler.bench.statistics import wilson_interval
 

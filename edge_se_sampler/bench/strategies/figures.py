@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.strategies.summary import Panel, compare, panels_of, strategies_of
 from edge_se_sampler.bench.strategies.trials import UNIFORM
 from edge_se_sampler.engine.figures import require_pyplot, style_axes

@@ -20,7 +20,7 @@ import torch
 from edge_se_sampler.bench.baselines.run import TimeIsUp
 from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views, skip_lpips_weights
 from edge_se_sampler.bench.outcomes import classify, measure_outcome
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.strategies.trials import Settings, Trial, measured_views, read_views, sampler_settings
 from edge_se_sampler.engine.metrics import compute_metrics
 from edge_se_sampler.engine.rendering import Picture, to_pictures

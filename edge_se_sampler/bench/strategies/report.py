@@ -14,7 +14,7 @@ from edge_se_sampler.bench.report import (
     markdown_table,
     read_notes,
 )
-from edge_se_sampler.bench.runner import Run, read_result
+from edge_se_sampler.bench.results import Run, read_result
 from edge_se_sampler.bench.strategies.claims import CLAIMS
 from edge_se_sampler.bench.strategies.figures import draw_differences
 from edge_se_sampler.bench.strategies.summary import (

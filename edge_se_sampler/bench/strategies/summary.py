@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from edge_se_sampler.bench.outcomes import failed
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.strategies.trials import ALL_MODELS, PLACEMENTS, STRATEGIES, UNIFORM
 
 Verdict = Literal["better", "same", "worse"]

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from edge_se_sampler.bench.outcomes import measure_outcome
-from edge_se_sampler.bench.runner import Run
+from edge_se_sampler.bench.results import Run
 from edge_se_sampler.bench.strategies.nerfacto import run_nerfacto
 from edge_se_sampler.bench.strategies.trials import (
     MODELS,
