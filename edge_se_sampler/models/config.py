@@ -12,7 +12,7 @@ from edge_se_sampler.protocol import ADDED_LATER, InstantiateConfig
 
 INFINITY = float("inf")
 MAX_DEPTH = 1e25
-"""World units: farther away float32 knows no sizes."""
+"""World units: a checkpoint's box, which reaches so far, may not be larger than 1e30."""
 MAX_SAMPLES, MAX_RAYS = 2**14, 2**24
 """Of a ray along it, and rays of a step: more would be a mistake, or a stranger's."""
 BYTES_PER_RAY = 2**15

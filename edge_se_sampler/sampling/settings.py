@@ -92,7 +92,7 @@ class SamplingSettings:
             ("early_steps", in_steps or not steps, not_in_steps),
             ("schedule", self.schedule != "adaptive" or self.early == "edge", needs_edges),
             ("edge_epsilon", 1e-6 <= self.edge_epsilon <= 1e6, epsilon_range),
-            ("se_candidates", 2 <= self.se_candidates <= 1000, "must be from 2, or there is no choice, to 1000"),
+            ("se_candidates", 2 <= self.se_candidates <= 1000, "must be from 2 to 1000: one alone is no choice"),
             ("importance_weight", 0 <= weight <= 1, "must be between 0 and 1"),
             ("importance_weight", not (weight and all_uniform), "has no effect when all pixels are drawn uniformly"),
             ("soft_mining_alpha", 0 <= self.soft_mining_alpha <= 1, "must be between 0 and 1"),
