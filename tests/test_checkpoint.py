@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import pickle
@@ -14,7 +15,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from edge_se_sampler.engine.checkpoint import MAGIC, latest_checkpoint, load_checkpoint, load_latest, save_checkpoint
+from edge_se_sampler.engine.checkpoint import (
+    MAGIC,
+    DamagedCheckpoint,
+    latest_checkpoint,
+    load_checkpoint,
+    load_latest,
+    save_checkpoint,
+)
 from edge_se_sampler.engine.files import write_atomically
 from edge_se_sampler.errors import InputError
 
@@ -89,6 +97,37 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path, kept: int):
     path = save_checkpoint(tmp_path, 1, state(1.0))
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(InputError, match=r"truncated|not a checkpoint"):
+        load_checkpoint(path, "d")
+
+
+LITTLE_MEMORY = """
+import resource, sys
+from pathlib import Path
+from edge_se_sampler.engine.checkpoint import load_checkpoint
+small, large = map(Path, sys.argv[1:])
+load_checkpoint(small, "d")  # what torch needs to load any
+taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (taken + large.stat().st_size * 3 // 2,) * 2)
+print(load_checkpoint(large, "d")["w"].shape)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc and RLIMIT_AS")
+def test_loading_takes_little_more_memory_than_the_tensors(tmp_path: Path):
+    small = save_checkpoint(tmp_path, 1, state(1.0))
+    large = save_checkpoint(tmp_path, 2, {"config_digest": "d", "w": torch.zeros(100, 10**6)})
+    command = [sys.executable, "-c", LITTLE_MEMORY, str(small), str(large)]
+    assert subprocess.run(command, check=True, capture_output=True, text=True).stdout == "torch.Size([100, 1000000])\n"
+
+
+def test_a_checkpoint_that_cannot_be_read_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = save_checkpoint(tmp_path, 1, state(1.0))
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(torch, "load", fail)
+    with pytest.raises(DamagedCheckpoint, match=r"step-000000001\.ckpt: cannot be read \(Input/output error\)"):
         load_checkpoint(path, "d")
 
 

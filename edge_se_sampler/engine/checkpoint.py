@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import re
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -105,31 +108,27 @@ def load_latest(folder: Path, config_digest: str) -> tuple[Path, dict[str, Any]]
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle, is none, or
-    was saved under another configuration."""
-    try:
-        file = SourceFile(path, SourceLocation(path))
-        file.check_regular()
-        locate_file(path.parent, path.name, SourceLocation(path.parent))
-        content = file.read_bytes()
-    except InputError as problem:
-        raise DamagedCheckpoint(str(problem)) from problem
-    header, _, payload = content.partition(b"\n")
-    magic = header[: len(MAGIC)]
-    if magic not in (MAGIC, MAGIC_2):
-        raise DamagedCheckpoint(f"{path}: not a checkpoint of this version of edge-se")
-    digest = hashlib.sha256(b"" if magic == MAGIC_2 else magic)
-    digest.update(payload)
-    if header[len(MAGIC) :] != digest.hexdigest().encode():
-        raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
-    try:
-        check_archive(payload)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "TypedStorage")  # torch 2.1's own use of it
-            state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
-    except Exception as problem:  # whatever a pickle that was made for it brings torch to raise
-        raise InputError(f"{path}: holds more than tensors and numbers (a pickle), which is never loaded") from problem
+    was saved under another configuration. It is read twice, first for its checksum, so that memory holds its tensors
+    alone."""
+    with _opened(path) as file:
+        header = file.read(len(MAGIC) + 65)
+        magic = header[: len(MAGIC)]
+        if magic not in (MAGIC, MAGIC_2):
+            raise DamagedCheckpoint(f"{path}: not a checkpoint of this version of edge-se")
+        archive = _Archive(file)
+        if header[len(MAGIC) :] != _hash(b"" if magic == MAGIC_2 else magic, archive) + b"\n":
+            raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
+        try:
+            check_archive(archive)  # pyright: ignore[reportArgumentType]
+            archive.seek(0)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "TypedStorage")  # torch 2.1's own use of it
+                state = torch.load(archive, map_location="cpu", weights_only=True)  # pyright: ignore[reportArgumentType]
+        except (MemoryError, OSError):
+            raise
+        except Exception as problem:  # whatever a pickle that was made for it brings torch to raise
+            found = "holds more than tensors and numbers (a pickle), which is never loaded"
+            raise InputError(f"{path}: {found}") from problem
     if not isinstance(state, dict) or state.get("config_digest") != config_digest:
         raise InputError(f"{path}: saved under another configuration than the run's config.json; do not mix runs")
     try:
@@ -137,6 +136,53 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     except ValueError as problem:
         raise InputError(f"{path}: was not saved by a training ({problem}); do not use it") from problem
     return state
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[io.FileIO]:
+    """A checkpoint's file; DamagedCheckpoint if it cannot be read, is no plain file, or is a link out of its folder."""
+    try:
+        SourceFile(path, SourceLocation(path)).check_regular()
+        locate_file(path.parent, path.name, SourceLocation(path.parent))
+    except InputError as problem:
+        raise DamagedCheckpoint(str(problem)) from problem
+    try:
+        with io.FileIO(path) as file:
+            yield file
+    except OSError as problem:
+        reason = problem.strerror or type(problem).__name__
+        raise DamagedCheckpoint(f"{path}: cannot be read ({reason}); check the file and its permissions") from problem
+
+
+class _Archive(io.RawIOBase):
+    """The rest of a file that was read up to here, as a file of its own: torch and zipfile seek in it."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self._start = file.tell()
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._file.tell() - self._start
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset + self._start * (whence == os.SEEK_SET), whence) - self._start
+
+    def readinto(self, buffer: Any) -> int | None:
+        return self._file.readinto(buffer)
+
+
+def _hash(magic: bytes, archive: _Archive) -> bytes:
+    """The sha256 of a line's beginning and the archive, in hexadecimal."""
+    digest, block = hashlib.sha256(magic), memoryview(bytearray(2**20))
+    while size := archive.readinto(block):
+        digest.update(block[:size])
+    return digest.hexdigest().encode()
 
 
 def _checkpoints(folder: Path) -> list[Path]:

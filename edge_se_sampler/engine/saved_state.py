@@ -6,11 +6,11 @@ continues from before a kernel, which knows no bounds, sees it.
 
 from __future__ import annotations
 
-import io
+import os
 import pickletools
 import zipfile
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import IO, Any
 
 import torch
 from torch import Tensor
@@ -35,12 +35,13 @@ GROUP = {"params", "lr", "betas", "eps", "weight_decay", "amsgrad", "initial_lr"
 """What Adam's groups have in every version of torch, and ours."""
 
 
-def check_archive(payload: bytes) -> None:
+def check_archive(file: IO[bytes]) -> None:
     """ValueError, or one of zipfile's, for what is not torch's archive of plain tensors, or is larger once unpacked."""
-    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+    size = file.seek(0, os.SEEK_END)
+    with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
         stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
-        if not stored or sum(entry.file_size for entry in entries) > len(payload):
+        if not stored or sum(entry.file_size for entry in entries) > size:
             raise ValueError("it is larger once unpacked")
         for entry in entries:
             if entry.filename.endswith(".pkl"):
