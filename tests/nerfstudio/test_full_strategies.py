@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 pytestmark = pytest.mark.nerfstudio_full
 pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio 1.1.5")
@@ -18,16 +19,21 @@ pytest.importorskip("nerfstudio.engine.trainer", reason="needs all of nerfstudio
 from capture_folder import OPENCV, write_transforms  # noqa: E402
 
 from edge_se_sampler.bench.baselines.folders import copied_scene  # noqa: E402
+from edge_se_sampler.bench.nerfstudio.host import build_trainer  # noqa: E402
 from edge_se_sampler.bench.strategies import nerfacto  # noqa: E402
+from edge_se_sampler.bench.strategies.nerfacto import nerfacto_config  # noqa: E402
 from edge_se_sampler.bench.strategies.train import run_trial  # noqa: E402
 from edge_se_sampler.bench.strategies.trials import (  # noqa: E402
     NERFACTO,
+    PLACEMENTS,
     STRATEGIES,
     Length,
     PlanName,
     Settings,
     Trial,
 )
+from edge_se_sampler.bench.train import offcenter_copies  # noqa: E402
+from edge_se_sampler.data.synthetic.folder import make_scenes  # noqa: E402
 
 SHORT = Settings(nerf=Length(1.5, 4, 2))
 TRIAL = Trial(NERFACTO, "mic", 1, "centered", "steps", "edge", 3)
@@ -74,3 +80,25 @@ def test_a_capture_is_measured_beside_its_mean_color(tmp_path: Path) -> None:
     assert run["foreground_psnr"] is None
     assert run["background_psnr"] > 0
     assert (run["outcome"] == "converged") == (run["psnr"] >= run["background_psnr"] + 0.5)
+
+
+def test_off_center_a_blender_scene_keeps_cameras_box_and_depths(host_scene: Path, tmp_path: Path) -> None:
+    (scene,) = make_scenes(tmp_path / "scenes", ["mic"], size=32, num_train=4, num_val=2, num_test=2)
+    copies = offcenter_copies(scene, tmp_path)
+    trainers = []
+    for placement in PLACEMENTS:
+        data = copied_scene(tmp_path, copies / placement, downscale=1)
+        config = nerfacto_config(replace(TRIAL, placement=placement), SHORT, data, tmp_path / "runs", is_object=True)
+        trainers.append(build_trainer(config, "test"))
+    centered, shifted = (trainer.pipeline.datamanager.train_dataset for trainer in trainers)
+    assert torch.equal(centered.cameras.camera_to_worlds, shifted.cameras.camera_to_worlds)
+    assert torch.equal(centered.scene_box.aabb, shifted.scene_box.aabb)
+    assert not torch.equal(centered.cameras.cx, shifted.cameras.cx)
+    assert {trainer.pipeline.model.collider.far_plane for trainer in trainers} == {6}
+
+
+def test_a_photographed_object_has_depths_of_its_own(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scene", OPENCV)
+    copy = copied_scene(tmp_path / "work", tmp_path / "scene", downscale=2)
+    model = nerfacto_config(TRIAL, SHORT, copy, tmp_path / "runs", is_object=True).pipeline.model
+    assert (model.background_color, model.far_plane, model.disable_scene_contraction) == ("white", 1000, False)

@@ -40,8 +40,8 @@ SMALL = {
     "datamanager.train-num-rays-per-batch": 512,
 }
 """Flags of the pipeline."""
-OF_OBJECTS = {
-    "model.background-color": "white",
+OF_OBJECTS = {"model.background-color": "white"}
+OF_BLENDER_SCENES = {
     "model.proposal-initial-sampler": "uniform",
     "model.near-plane": 2,
     "model.far-plane": 6,
@@ -49,7 +49,9 @@ OF_OBJECTS = {
     "model.disable-scene-contraction": True,
     "model.distortion-loss-mult": 0,
 }
-"""What nerfstudio's own benchmark sets for NeRF's Blender scenes, too."""
+"""With `OF_OBJECTS`, what nerfstudio's own benchmark sets for NeRF's Blender scenes, too."""
+LEARNING_RATES = {"optimizers.fields.optimizer.lr": 3e-3, "optimizers.proposal-networks.optimizer.lr": 3e-3}
+"""Flags; with nerfstudio's own, 1e-2, so few rays a step often end in one color everywhere."""
 NEVER = 10**9
 
 
@@ -88,15 +90,26 @@ def run_nerfacto(trial: Trial, settings: Settings, data: Path) -> Run:
 
 def nerfacto_config(trial: Trial, settings: Settings, data: Path, folder: Path, is_object: bool) -> Any:
     """nerfstudio's config of a trial."""
-    flags = SMALL | (OF_OBJECTS if is_object else {})
-    arguments = [text for name, value in flags.items() for text in (f"--pipeline.{name}", str(value))]
+    is_blender = trial.placement == "shifted" or not (data / "transforms.json").exists()
+    flags = SMALL | (OF_OBJECTS if is_object else {}) | (OF_BLENDER_SCENES if is_blender else {})
+    flags = {f"pipeline.{name}": value for name, value in flags.items()} | LEARNING_RATES
+    arguments = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
     config = build_config("edge-se-nerfacto", trial.seed, data, folder, arguments)
+    if trial.placement == "shifted":
+        _keep_world(config.pipeline.datamanager.dataparser)
     config.max_num_iterations = settings.nerf.steps if trial.plan == "steps" else NEVER
     config.steps_per_save = NEVER
     config.vis, config.logging.local_writer.enable = "none", False  # writers outlive a training, and its folder
     for name, value in sampler_settings(trial.strategy, settings.nerf).items():
         setattr(config.pipeline.datamanager.pixel_sampler, name, value)
     return config
+
+
+def _keep_world(parser: Any) -> None:
+    """Let nerfstudio's own format, which has images off center, keep cameras and box as its parser of Blender scenes
+    does: `OF_BLENDER_SCENES` names depths in that world."""
+    parser.orientation_method = parser.center_method = "none"
+    parser.auto_scale_poses, parser.scene_scale = False, 1.5
 
 
 def _train(trainer: Any, seconds: float | None) -> dict[str, Any]:
