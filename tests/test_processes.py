@@ -34,6 +34,7 @@ DENSE = {
     f"{SAMPLER}.early_fraction": 0.3,
 }
 LEAN = {f"{MANAGER}.train_num_rays_per_batch": 250, f"{SAMPLER}.late": "se", f"{SAMPLER}.early_fraction": 0.3}
+HARD = DENSE | {f"{MODEL}.hard_samples": True}
 CACHED = {f"{SAMPLER}.error_source": "cached"}
 TRAININGS = {
     "dense": ("edge-se-nerf", DENSE),
@@ -41,6 +42,8 @@ TRAININGS = {
     "dense, in chunks": ("edge-se-nerf", DENSE | {f"{MANAGER}.train_num_rays_per_batch": 683}),
     "dense, cached errors": ("edge-se-nerf", DENSE | CACHED),
     "dense, adaptive schedule": ("edge-se-nerf", DENSE | {f"{SAMPLER}.schedule": "adaptive", "reinit_dead": True}),
+    "dense, hard samples": ("vanilla-nerf", HARD | {f"{MANAGER}.train_num_rays_per_batch": 683}),
+    "dense, hard samples in cells": ("edge-se-info-nerf", HARD | {f"{MODEL}.empty_space_skipping": True}),
     "unseen rays": ("edge-se-info-nerf", DENSE | {f"{MODEL}.num_unseen_rays": 7}),
     "lean": ("lean-nerf", {f"{MANAGER}.train_num_rays_per_batch": 250}),
     "lean, rendered errors": ("lean-nerf", LEAN),
@@ -109,8 +112,8 @@ def check_same_losses(trainings: list[str], scene: Path, output_dir: Path) -> No
     for training in trainings:
         losses, seen = curves_of(training, scene, output_dir / "one")
         assert two[training][0] == pytest.approx(losses, rel=2e-2), training
-        # rounding puts a sample on either side of a threshold now and then, which a step's loss shows
-        different = [step for step in range(STEPS) if two[training][0][step] != pytest.approx(losses[step], rel=1e-5)]
+        # rounding puts a sample on either side of a threshold now and then, which the losses show from then on
+        different = [step for step in range(STEPS) if two[training][0][step] != pytest.approx(losses[step], rel=1e-4)]
         assert len(different) <= STEPS // 10, (training, different)
         assert two[training][1] == pytest.approx(seen, rel=1e-3), training
     assert len(list(output_dir.glob("two/*/*/*/checkpoints/*.ckpt"))) == len(trainings)

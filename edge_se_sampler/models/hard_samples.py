@@ -1,7 +1,7 @@
 """Hard samples along the rays: all samples are evaluated, few are differentiated (Korhonen et al. 2024, "Efficient NeRF
 Optimization - Not All Samples Remain Equally Hard", arXiv 2408.03193).
 
-m   samples that a field is evaluated at together
+m   samples that a field is evaluated at together, by all ranks
 g   norm of the loss's gradient by a sample's raw outputs, before their activations: how hard the sample is
 M   (sum g)^2 / sum g^2, the number of samples that g is effectively spread over
 pi  min(1, M g / sum g), probability with which a sample is kept
@@ -21,13 +21,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from edge_se_sampler import ranks
 from edge_se_sampler.models.field import NeRFField
 
 
 def keep_probability(hardness: Tensor) -> Tensor:
-    """pi of samples of hardness g >= 0, (m,) -> (m,); 0 only where g is."""
-    share = hardness / hardness.max().clamp(min=torch.finfo(hardness.dtype).tiny)  # else squares underflow
-    return (share * share.sum() / share.square().sum().clamp(min=1)).clamp(max=1)
+    """pi of samples of hardness g >= 0, (m,) -> (m,), among those of all ranks; 0 only where g is."""
+    tiny = torch.finfo(hardness.dtype).tiny
+    largest = ranks.find_largest(torch.cat((hardness, hardness.new_full((1,), tiny))).amax())
+    share = hardness / largest  # else squares underflow
+    total, squares = ranks.add_up(torch.stack((share.sum(), share.square().sum())))
+    return (share * total / squares.clamp(min=1)).clamp(max=1)
 
 
 def raw_gradient_norm(field: NeRFField, outputs: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
@@ -51,9 +55,9 @@ class _HardSamples(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         positions, directions, ray_indices, noise, uniform, *outputs = ctx.saved_tensors
         parameters = tuple(ctx.field.parameters())
-        if len(positions) == 0:  # no ray meets a cell
-            return None, None, None, *map(torch.zeros_like, parameters)
         probability = keep_probability(raw_gradient_norm(ctx.field, outputs, gradients))
+        if len(positions) == 0:  # no ray meets a cell, or this rank has none
+            return None, None, None, *map(torch.zeros_like, parameters)
         kept = torch.nonzero(uniform < probability)[:, 0]
         if ray_indices is None:
             rays = torch.div(kept, len(positions) // len(directions), rounding_mode="floor")

@@ -70,16 +70,20 @@ class NeRFModel(RayModel):
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
         """Weights (n, s), colors (n, 3), and (densities, intervals) (n, s) of rays sampled at t (n, s)."""
         positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
-        noise = None
+        noise = uniform = None
         if self.training and self.config.density_noise:
             noise = self.draw(torch.randn, *t.shape).reshape(-1) * self.config.density_noise
+        if self.training and self.config.hard_samples and torch.is_grad_enabled():
+            uniform = self.uniform(*t.shape).reshape(-1)
         if self.grid is None:
-            density, color = self._evaluate(field, positions, rays.directions, None, noise)
+            density, color = _evaluate(field, positions, rays.directions, None, noise, uniform)
         else:
             packed = torch.nonzero(self.grid.contains(positions))[:, 0]
             ray_indices = torch.div(packed, t.shape[1], rounding_mode="floor")
-            noise = None if noise is None else noise[packed]
-            packed_density, packed_color = self._evaluate(field, positions[packed], rays.directions, ray_indices, noise)
+            noise, uniform = (None if drawn is None else drawn[packed] for drawn in (noise, uniform))
+            packed_density, packed_color = _evaluate(
+                field, positions[packed], rays.directions, ray_indices, noise, uniform
+            )
             density = t.new_zeros(t.numel()).index_put((packed,), packed_density)
             color = t.new_zeros((t.numel(), 3)).index_put((packed,), packed_color)
         # a softplus is never 0: over an endless interval it would hide every background
@@ -88,11 +92,16 @@ class NeRFModel(RayModel):
         weights = sample_weights(density, delta)
         return weights, composite(weights, color.reshape(*t.shape, 3), background), (density, delta)
 
-    def _evaluate(
-        self, field: NeRFField, positions: Tensor, directions: Tensor, ray_indices: Tensor | None, noise: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """What the field returns; where gradients are wanted and the config says so, those of the hard samples only."""
-        if not (self.config.hard_samples and self.training and torch.is_grad_enabled()):
-            return field(positions, directions, ray_indices, noise)
-        uniform = self.uniform(len(positions), 1)[:, 0]
-        return evaluate_hard_samples(field, positions, directions, ray_indices, noise, uniform)
+
+def _evaluate(
+    field: NeRFField,
+    positions: Tensor,
+    directions: Tensor,
+    ray_indices: Tensor | None,
+    noise: Tensor | None,
+    uniform: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """What the field returns; with a number from [0, 1) for every sample, the gradients of the hard samples only."""
+    if uniform is None:
+        return field(positions, directions, ray_indices, noise)
+    return evaluate_hard_samples(field, positions, directions, ray_indices, noise, uniform)
