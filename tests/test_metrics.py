@@ -51,6 +51,11 @@ def test_ssim_equals_scikit_image(height: int, width: int, dtype: type) -> None:
     assert ssim(first, second) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.parametrize(("first", "second"), [(1.0, 0.999), (0.8, 0.79), (1.0, 1.0)])
+def test_ssim_of_flat_images_is_as_exact(first: float, second: float) -> None:
+    assert ssim(gray(first), gray(second)) == pytest.approx(reference_ssim(gray(first), gray(second)), abs=1e-6)
+
+
 def test_ssim_leaves_the_border_out() -> None:
     """Images that differ in row 0 alone: only the windows around row 5 reach it. Counting the border answers lower."""
     first = blurred_noise(0, 40, 40)

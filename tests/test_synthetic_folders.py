@@ -99,6 +99,7 @@ BAD_ARGUMENTS = [
     pytest.param({"names": []}, "names is empty", id="no name"),
     pytest.param({"names": ["mic", "mic"]}, "names.*twice", id="twice"),
     pytest.param({"size": 7}, "size is 7.*at least 8", id="size"),
+    pytest.param({"size": 10**18}, "size is 10*.*at most 8192", id="large"),
     pytest.param({"num_train": 0}, "num_train is 0.*at least 1", id="no train"),
     pytest.param({"num_val": -1}, "num_val is -1.*at least 0", id="negative val"),
     pytest.param({"num_test": -2}, "num_test is -2.*at least 0", id="negative test"),

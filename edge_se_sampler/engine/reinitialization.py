@@ -25,7 +25,7 @@ PROBE_RAYS = 512
 
 def dead_networks(model: RayModel, probes: Sequence[RayBundle]) -> list[str]:
     """Names of the model's networks that have no density at any sample of the rays."""
-    # accumulation 0: the last interval is endless, so that the smallest density anywhere makes its ray opaque
+    # accumulation 0: any density at a sample makes its ray a little opaque
     return [
         name for name in model.networks if not any(render_rays(model, r, f"accumulation_{name}").any() for r in probes)
     ]

@@ -23,6 +23,7 @@ from edge_se_sampler.errors import InputError
 FIELD_OF_VIEW = 0.6911112070083618  # radians, as in NeRF's Blender scenes
 DISTANCE = 4.031128874149275  # of the cameras from the origin, world units; likewise
 MIN_FRAME = 8  # pixels; in less an object is a blot
+MAX_FRAME = 8192
 
 Placement = Literal["centered", "padded", "shifted", "rotated"]
 Split = Literal["train", "val", "test"]
@@ -85,10 +86,11 @@ def framing(size: int, placement: Placement = "centered", offset: tuple[float, f
     rotates the cameras until the world's origin is at the shifted pixel: every loader reads that, but perspective
     stretches the object.
 
-    InputError for an unknown placement, or if the size or the offset leaves the object fewer than 8 pixels.
+    InputError for an unknown placement, a size above 8192, or if the size or the offset leaves the object fewer than 8
+    pixels.
     """
-    if size < MIN_FRAME:
-        raise InputError(f"size is {size} pixels: give at least {MIN_FRAME}")
+    if not MIN_FRAME <= size <= MAX_FRAME:
+        raise InputError(f"size is {size} pixels: give at least {MIN_FRAME} and at most {MAX_FRAME}")
     if placement not in get_args(Placement):
         raise InputError(f"placement is {placement!r}: give one of {', '.join(get_args(Placement))}")
     if placement == "centered":
