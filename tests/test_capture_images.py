@@ -185,7 +185,7 @@ def test_more_than_the_machine_has_is_refused_before_decoding(tmp_path: Path, mo
     write_transforms(tmp_path)
     monkeypatch.setattr(memory, "MIN_SIDE", 8)
     monkeypatch.setattr("edge_se_sampler.data.frames.read_image", None)  # would not be callable
-    third = 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + 20)
+    third = 7 * (WIDTH // 3) * (HEIGHT // 3) * (2 * 3 + memory.BYTES_OF_TABLES)
     for available, of_pixel, remedy in (
         (third, 0, "give --downscale 3"),
         (third, 200, "give --downscale 4"),  # the model's is in proportion to the longest side
@@ -205,7 +205,7 @@ def test_what_training_takes_is_known_of_views_that_were_read(tmp_path: Path, mo
         return longest * 2 ** (22 if has_alpha else 23)
 
     of_model = read(tmp_path, model_memory=of_pixels).subset([0, 2])
-    assert of_model.memory == "images 0.1 MiB, tables 0.2 MiB, model up to 0.4 GiB; 3.0 GiB available"
+    assert of_model.memory == "images 0.1 MiB, tables 0.3 MiB, model up to 0.4 GiB; 3.0 GiB available"
     assert read(tmp_path, downscale=2).memory == "images 0.0 MiB, tables 0.1 MiB; 3.0 GiB available"
     for i, name in enumerate(NAMES):
         iio.imwrite(tmp_path / "images" / name, np.dstack((picture(i), picture(i)[..., 0])))
@@ -233,7 +233,7 @@ def test_train_and_inspect_say_what_training_takes(
     ]
     found = [re.search(r"^memory +(.*)$", answer.out, re.MULTILINE) for answer in answers]
     assert [match and match[1] for match in found] == [
-        "images 0.1 MiB, tables 0.2 MiB, model up to 0.3 GiB; 3.0 GiB available"
+        "images 0.1 MiB, tables 0.3 MiB, model up to 0.3 GiB; 3.0 GiB available"
     ] * 2
 
 

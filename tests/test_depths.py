@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from capture_folder import write_blender, write_colmap
 from tiny import ball_views
 
@@ -94,6 +96,54 @@ def test_a_single_camera_tells_nothing() -> None:
     given = override(config, {"pipeline.model.near": 10.0, "pipeline.model.far": 60.0})
     model = lean_model(resolve_config(given, view))
     assert (model.depths, model.near_share) == ((10, 60), None)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (-8.0, 0.0, 0.0), (-60.0, 3.0, 40.0)])
+@pytest.mark.parametrize("show", [opaque, lambda views: views])
+def test_nothing_is_told_by_where_the_origin_is(
+    shift: tuple[float, float, float], show: Callable[[Views], Views]
+) -> None:
+    """Of one optical axis, and of parallel ones, no point is nearest to all of them."""
+    ball = ball_views(6, 32)
+    poses = ball.cameras.camera_to_worlds[:1].repeat(6, 1, 1)
+    poses[:, :, 3] += torch.linspace(-0.2, 0.2, 6)[:, None] * poses[:, :, 0]
+    parallel = replace(
+        ball, images=ball.images[:1] * 6, cameras=replace(ball.cameras, camera_to_worlds=poses.contiguous())
+    )
+    for views in (ball.subset([0]), parallel):
+        with pytest.raises(InputError, match="give both near and far"):
+            find_depths(show(moved(views, 1.0, shift)))
+
+
+def test_rays_begin_before_all_points_even_of_cameras_that_look_past_what_they_surround() -> None:
+    views = opaque(moved(ball_views(24, 32), 1.0, (0.0, 0.0, 0.0)))
+    turn = torch.tensor([[0.82, 0.0, -0.57], [0.0, 1.0, 0.0], [0.57, 0.0, 0.82]], dtype=torch.float64)  # 35 degrees
+    poses = views.cameras.camera_to_worlds.clone()
+    poses[:, :, :3] = poses[:, :, :3] @ turn
+    cameras = replace(views.cameras, camera_to_worlds=poses)
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    found = find_depths(replace(views, cameras=cameras, points=(points,) * 24))
+    focus = find_focus(cameras)[0]
+    depths = np.concatenate([cameras.project(i, torch.from_numpy(points))[1].numpy() for i in range(24)])
+    begin = np.repeat(np.linalg.norm(poses[:, :, 3].numpy() - focus, axis=1), len(points)) * found.near_share
+    assert found.near_share > 0.3
+    assert (depths < begin).mean() < 0.01
+
+
+def test_a_view_from_close_by_is_not_cut_off() -> None:
+    views = moved(ball_views(12, 64, radius=0.35), 1.0, (0.0, 0.0, 0.0))
+    close = moved(ball_views(12, 64, radius=0.35 * 4 / 1.1), 1.1 / 4, (0.0, 0.0, 0.0))  # the same ball, 1.1 away
+    poses = torch.cat((views.cameras.camera_to_worlds[:10], close.cameras.camera_to_worlds[10:]))
+    both = replace(
+        views,
+        images=(*views.images[:10], *close.images[10:]),
+        cameras=replace(views.cameras, camera_to_worlds=poses),
+    )
+    found = find_depths(both)
+    assert found.source == "the silhouettes"
+    assert 0.3 < found.near <= 1.1 - 0.35
 
 
 def test_focus() -> None:

@@ -49,6 +49,12 @@ def test_opaque_images_are_averaged_and_the_rest_is_cut_off() -> None:
     np.testing.assert_array_equal(small[1, 0], np.rint(image[3:6, :3].mean(axis=(0, 1))).astype(np.uint8))
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_white_stays_white_however_many_pixels_become_one(channels: int) -> None:
+    white = np.full((1000, 500, channels), 255, np.uint8)
+    assert (average_pixels(white, 500) == 255).all()
+
+
 def test_a_small_pixel_is_trained_on_if_all_of_it_is() -> None:
     mask = np.ones((8, 6), dtype=bool)
     mask[3, 4] = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -422,3 +423,34 @@ def test_all_pixels_of_a_camera_inside_the_hull_are_found() -> None:
     views = views_of(rods())
     around = Hull(np.full(3, -6.0), 12.0, np.ones((1, 1, 1), dtype=bool))
     assert all(hit.all() for hit in find_hit_pixels(views, around))
+
+
+def test_cells_with_their_center_on_a_cameras_plane_have_no_rectangle() -> None:
+    views = views_of(rods(), size=33)
+    pose = np.eye(4)[None, :3]
+    cameras = Cameras.of(pose, fx=33, fy=33, cx=16.5, cy=16.5, width=33, height=33)
+    centers = np.array([(0.0, 0, 0), (1, 2, 0), (0, 0, -4), (0, 0, 4)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        low, high, side = project_cells(cameras, 0, centers, 0.5)
+        find_silhouettes(views)[0].overlaps(low, high)
+    assert side.tolist() == [STRADDLING, STRADDLING, IN_FRONT, BEHIND]
+    assert np.isfinite(low).all()
+    assert np.isfinite(high).all()
+
+
+def test_only_pixels_that_are_trained_on_count_as_showing_something() -> None:
+    views = views_of(rods())
+    count = [int((image[..., 3] > 0).sum()) for image in views.images]
+
+    def shown(views: Views) -> int:
+        return analyze_views(views, LeanModelConfig(size="paper")).num_pixels
+
+    masks = tuple(np.arange(100)[:, None] < np.full(100, 50) for _ in views.images)
+    half = sum(int((image[:50, :, 3] > 0).sum()) for image in views.images)
+    empty = tuple(image * np.uint8(i > 4) for i, image in enumerate(views.images))
+    assert shown(views) == sum(count)
+    assert shown(replace(views, masks=masks)) == half
+    assert shown(replace(views, images=empty)) == sum(count[5:])
+    opaque = tuple(image[..., :3] for image in views.images)
+    assert shown(replace(views, images=opaque, masks=masks)) == 100 * 50 * len(masks)

@@ -143,6 +143,20 @@ def test_a_lens_that_distorts_is_heeded(truth: list[np.ndarray]) -> None:
     assert not len(find_pixels(cameras, 0, lens, torch.from_numpy(behind[None]).float())[0])
 
 
+def test_a_fisheye_sees_to_its_borders() -> None:
+    """170 degrees across the image's width: a pinhole would show the outermost points far outside of it."""
+    focal = SIZE / np.radians(170)
+    lens = Intrinsics(focal, focal, SIZE / 2, SIZE / 2, Lens(fisheye=True, coefficients=(0, 0, 0, 0, 0)))
+    cameras = Cameras.of(np.eye(4)[None, :3], fx=focal, fy=focal, cx=SIZE / 2, cy=SIZE / 2, width=SIZE, height=SIZE).to(
+        dtype=torch.float32
+    )
+    angle = np.radians(np.linspace(-84, 84, 75))
+    points = torch.from_numpy(np.stack((np.sin(angle), 0 * angle, -np.cos(angle)), axis=1)).float()
+    rows, pixels = find_pixels(cameras, 0, lens, points)
+    assert rows.tolist() == list(range(75))
+    np.testing.assert_allclose(pixels[1] + 0.5, SIZE / 2 + focal * angle, atol=0.6)
+
+
 def test_votes_are_the_share_of_the_other_views(truth: list[np.ndarray]) -> None:
     masks = list(truth)
     masks[0] = np.zeros_like(masks[0])

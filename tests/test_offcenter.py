@@ -122,6 +122,17 @@ class TestPixels:
             assert masks[2].all()  # of a frame that has none all counts, as before
             assert iio.imread(folder / "m.png").shape == (6, 10)  # gray, as other hosts want it
 
+    def test_masks_that_are_soft_stay_so(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        mask = pixels(9, channels=3)[..., 0]
+        assert len(set(mask.flatten().tolist()) - {0, 255}) > 2
+        iio.imwrite(tmp_path / "scene/m.png", mask)
+        for frame in doc["frames"]:
+            frame["mask_path"] = "m"
+        write_json(tmp_path / "scene", doc)
+        for folder, corner in copies_of(tmp_path / "scene"):
+            np.testing.assert_array_equal(iio.imread(folder / "m.png"), on_canvas(mask, 10, 6, *corner))
+
     def test_masks_that_no_json_lists_hide_it_too(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene")
         mask = pixels(9, channels=3)[..., 0] & 1

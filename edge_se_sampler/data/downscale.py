@@ -8,10 +8,10 @@ import numpy as np
 def average_pixels(image: np.ndarray, factor: int) -> np.ndarray:
     """(H, W, 3|4) uint8, straight alpha -> (H // factor, W // factor, 3|4) uint8, straight alpha."""
     if image.shape[2] == 3:
-        return np.rint(_blocks(image, factor).mean(axis=(1, 3), dtype=np.float32)).astype(np.uint8)
+        return np.rint(_blocks(image, factor).mean(axis=(1, 3), dtype=np.float64)).astype(np.uint8)
     alpha = image[..., 3:].astype(np.float32)
-    color = _blocks(image[..., :3] * alpha, factor).mean(axis=(1, 3))
-    alpha = _blocks(alpha, factor).mean(axis=(1, 3))
+    color = _blocks(image[..., :3] * alpha, factor).mean(axis=(1, 3), dtype=np.float64)
+    alpha = _blocks(alpha, factor).mean(axis=(1, 3), dtype=np.float64)
     color = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
     return np.rint(np.concatenate((color, alpha), axis=2)).astype(np.uint8)
 

@@ -187,7 +187,7 @@ def _check_size(frame: Frame, downscale: int) -> None:
 def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.ndarray | None]:
     """The image (H, W, 3|4) uint8 of a frame, and where it may be trained on, (H, W) bool; None: everywhere."""
     image = turn_upright(read_image(frame.image), frame.header.orientation)
-    mask = None if frame.mask is None else _read_mask(frame.mask, image)
+    mask = None if frame.mask is None else read_mask(frame.mask, image)
     if mask is not None and settings.masks == "object":
         alpha = np.minimum(mask, image[..., 3]) if image.shape[2] == 4 else mask
         image, mask = np.concatenate((image[..., :3], alpha[..., None]), axis=2), None
@@ -207,7 +207,7 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
     return average_pixels(image, factor), None if mask is None else shrink_mask(mask, factor)
 
 
-def _read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
+def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8: the largest color of the pixels of an image's mask, which is turned as its own orientation says if
     that gives it the image's size."""
     height, width = size = image.shape[:2]

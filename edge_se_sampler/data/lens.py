@@ -128,11 +128,12 @@ def _polynomial(k: Sequence[float], square: np.ndarray) -> np.ndarray:
 
 def _largest_radius(lens: Lens, largest: float) -> float:
     """The r up to which a point that is farther out is shown farther out; infinity if that is beyond `largest`."""
-    r = np.linspace(0, largest, NUM_RADII)
     if lens.fisheye:
-        angle, k = np.arctan(r), lens.coefficients
+        angle, k = np.linspace(0, np.arctan(largest), NUM_RADII), lens.coefficients
+        r = np.tan(angle)
     else:
-        angle, k = r, (*lens.coefficients[:2], lens.coefficients[4])
+        angle = r = np.linspace(0, largest, NUM_RADII)
+        k = (*lens.coefficients[:2], lens.coefficients[4])
     shown = angle * _polynomial(k, angle * angle)
     turns = np.flatnonzero(~(np.diff(shown) > 0))
     return float(r[turns[0]]) if len(turns) else np.inf

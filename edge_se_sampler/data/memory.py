@@ -15,8 +15,9 @@ from edge_se_sampler.data.scene_file import SourceLocation
 
 COPIES = 2
 """Of all pixels: training stacks the images of one size."""
-BYTES_OF_TABLES = 20
-"""Of a pixel, beside its colors: edge strengths, probabilities and masks, as pixel samplers keep them."""
+BYTES_OF_TABLES = 26
+"""Of a pixel, beside its colors: edge strengths, probabilities and masks, as pixel samplers keep them, where there are
+masks; a few less where there are none."""
 BYTES_AT_WORK = 60
 """Of a pixel of an image that is undistorted and averaged, at most: colors and where they come from, in float32."""
 MEMORY_AT_WORK = 3 * 2**29

@@ -26,6 +26,7 @@ import numpy as np
 
 from edge_se_sampler.data.blender import has_views, read_blender, transforms_path
 from edge_se_sampler.data.capture import SPLITS, Split
+from edge_se_sampler.data.frames import read_mask
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
 from edge_se_sampler.data.transforms_frames import Entry, listed_file, read_entries, read_lens
@@ -125,13 +126,13 @@ def offcenter(
         for split, files in plan.items():
             views = read_blender(data, split)
             canvases = [Canvas.of(image, shift, pad) for image in views.images]
-            document = read_json(transforms_path(data, split)).object()
+            top = read_json(transforms_path(data, split))
+            document, entries = top.object(), read_entries(top, data)
             for copy in canvases[0].corners:
                 (folder / copy).mkdir(parents=True, exist_ok=True)
                 text = json.dumps(_document(document, files, views, canvases, copy), indent=4)
                 transforms_path(folder / copy, split).write_text(text, encoding="utf-8")
-            masks = views.masks or (None,) * len(canvases)
-            for _ in pool.map(partial(_write_view, folder), files, canvases, views.images, masks):
+            for _ in pool.map(partial(_write_view, folder), files, canvases, views.images, entries):
                 done += 1
                 progress(done, total)
     return [target / "centered", target / "shifted"]
@@ -239,15 +240,13 @@ def _is_listed_png(path: str | None) -> bool:
     return path is not None and listed_file(path).lower().endswith(".png")
 
 
-def _write_view(
-    folder: Path, files: dict[str, str], canvas: Canvas, image: np.ndarray, mask: np.ndarray | None
-) -> None:
-    """One view's picture into both copies and, where its frame has one, its mask (H, W) bool as gray."""
+def _write_view(folder: Path, files: dict[str, str], canvas: Canvas, image: np.ndarray, entry: Entry) -> None:
+    """One view's picture into both copies and, where its frame has one, its mask, whose grays may be alpha."""
     background = plain_background(image)
     assert background is not None  # _plan_copies has checked that
     layers: dict[str, tuple[np.ndarray, np.ndarray]] = {files["file_path"]: (image, background)}
-    if mask is not None and "mask_path" in files:
-        layers[files["mask_path"]] = (mask * np.uint8(255), np.zeros((), np.uint8))
+    if entry.mask is not None:
+        layers[files["mask_path"]] = (read_mask(entry.mask, image), np.zeros((), np.uint8))
     for copy, corner in canvas.corners.items():
         for file, (layer, around) in layers.items():
             path = folder / copy / file

@@ -80,7 +80,9 @@ def find_pixels(
     if lens.lens is None:
         inside = (depth > 0) & ((coords >= 0) & (coords < size)).all(dim=1)
     else:
-        inside = (depth > 0) & ((coords > -size) & (coords < 2 * size)).all(dim=1)  # lenses move nothing farther
+        inside = depth > 0
+        if not lens.lens.fisheye:  # other lenses move nothing farther
+            inside &= ((coords > -size) & (coords < 2 * size)).all(dim=1)
         y, x = coords[inside].double().numpy().T
         shown, kept = locate(lens, lens, int(size[1]), int(size[0]), x - 0.5, y - 0.5)
         coords[inside] = torch.from_numpy(shown[::-1].T + 0.5).float().clamp(min=0).minimum(size - 1)

@@ -87,7 +87,7 @@ def _depths_of_features(views: Views) -> DepthRange | None:
     found = _depths_of_points(views_with_points, "features that several images show", FEATURE_MARGIN)
     if found is None or not found.near_share:
         return found
-    (closest,) = _rounded(found.near_share * find_focus(views.cameras)[1].min())
+    (closest,) = _rounded(found.near_share * _distances(views.cameras, find_focus(views.cameras)[0]).min())
     return replace(found, near=min(found.near, closest))
 
 
@@ -100,10 +100,10 @@ def _reach(views: Views) -> tuple[float, float, float] | None:
     if not ahead.any():
         return None
     low, high = np.percentile(depths[ahead], POINT_PERCENTILES)
-    _, focus_depth = find_focus(views.cameras)
+    focus, focus_depth = find_focus(views.cameras)
     if not (focus_depth > 0).all():
         return low, high, 0.0
-    shares = depths / np.repeat(focus_depth, [len(points) for points in seen])
+    shares = depths / np.repeat(_distances(views.cameras, focus), [len(points) for points in seen])
     return low, high, min(float(np.percentile(shares[ahead], POINT_PERCENTILES[0])), 0.99)
 
 
@@ -121,12 +121,14 @@ def _depths_of_silhouettes(views: Views) -> DepthRange | None:
         return None
     lowest, highest = _depths_of_hull(views.cameras, hull)
     reach = np.sqrt(3) / 2 * cell_size  # of a cell around its center
-    near, far = _rounded(max(lowest - reach, CAMERA_FACTORS[0] * distance), highest + reach)
+    least = CAMERA_FACTORS[0] * np.where(depth > 0, depth, distance)
+    near, far = _rounded(np.maximum(lowest - reach, least).min(), highest.max() + reach)
     return DepthRange(near, far, "the silhouettes") if near < far else None
 
 
-def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[float, float]:
-    """Least and greatest depth, in the views that see them, of the centers of cells that enough views see."""
+def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest depth (n,), in each view, of the centers that it sees of cells that enough views see; infinite
+    and minus infinite if it sees none."""
     centers = hull.aabb_min + (np.argwhere(hull.cells) + 0.5) * hull.cell_size
     depths = np.full((len(cameras), len(centers)), np.nan)
     for i in range(len(cameras)):
@@ -136,7 +138,7 @@ def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[float, float]:
         depths[i, in_image] = depth[in_image]
     seen = (~np.isnan(depths)).sum(axis=0)
     depths = depths[:, (seen > 0) & (seen >= MIN_SEEN * seen.max())]
-    return float(np.nanmin(depths, initial=np.inf)), float(np.nanmax(depths, initial=-np.inf))
+    return np.nanmin(depths, axis=1, initial=np.inf), np.nanmax(depths, axis=1, initial=-np.inf)
 
 
 def _depths_of_cameras(views: Views) -> DepthRange | None:
@@ -147,6 +149,11 @@ def _depths_of_cameras(views: Views) -> DepthRange | None:
         return None
     near, far = _rounded(*(factor * distance for factor in CAMERA_FACTORS))
     return DepthRange(near, far, "the cameras: 0.3 to 2 times as far as what they look at", NEAR_SHARE)
+
+
+def _distances(cameras: Cameras, focus: np.ndarray) -> np.ndarray:
+    """(n,) distance of each camera from the focus."""
+    return np.linalg.norm(cameras.camera_to_worlds[:, :, 3].numpy() - focus, axis=1)
 
 
 def _depth(cameras: Cameras, camera: int, points: np.ndarray) -> np.ndarray:

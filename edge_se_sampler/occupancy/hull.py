@@ -33,6 +33,8 @@ INITIAL_RESOLUTION = 16
 """Cells along the box when carving begins."""
 MIN_CANDIDATES = 0.8
 """Share of the cells still undecided below which the others are dropped; not at once, for copying takes time, too."""
+MIN_ANGLE = 1e-3
+"""Radians that optical axes deviate from parallel ones, root mean square, if they are to meet somewhere."""
 IN_FRONT, STRADDLING, BEHIND = 1, 0, -1
 """Where a cell is, relative to a camera's plane."""
 
@@ -96,11 +98,14 @@ def find_box(views: Views, near: float, far: float) -> Box:
 
 
 def find_focus(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """The point (3,) nearest to all optical axes, world units, and its depth (n,) in each camera."""
+    """The point (3,) nearest to all optical axes, world units, and its depth (n,) in each camera; depths of 0 where the
+    axes are parallel, or there is only one, so that many points are as near."""
     poses = cameras.camera_to_worlds.numpy()
     position, forward = poses[:, :, 3], -poses[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     center = np.linalg.lstsq(across.sum(axis=0), (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=None)[0]
+    if np.linalg.eigvalsh(across.sum(axis=0))[0] < MIN_ANGLE**2 * len(forward):
+        return center, np.zeros(len(forward))
     return center, ((center - position) * forward).sum(axis=1)
 
 
@@ -203,19 +208,21 @@ def project_cells(
     """The rectangles into which one camera projects cells, by their centers (m, 3), world units.
 
     Returns:
-        least and greatest u, v (2, m) each, without meaning for cells that are not in front of the camera; whether each
-        cell is all IN_FRONT, all BEHIND, or STRADDLING the camera's plane, (m,).
+        least and greatest u, v (2, m) each, 0 for cells that are not in front of the camera; whether each cell is all
+        IN_FRONT, all BEHIND, or STRADDLING the camera's plane, (m,).
     """
     coords, z = (values.numpy() for values in cameras.project(camera, torch.from_numpy(centers)))
     rotation = cameras.camera_to_worlds[camera, :, :3].numpy()
     half_x, half_y, half_z = cell_size / 2 * np.abs(rotation).sum(axis=0)
     side = np.where(z > half_z, IN_FRONT, np.where(z < -half_z, BEHIND, STRADDLING))
-    closest = np.where(side == IN_FRONT, z - half_z, np.inf)
+    in_front = side == IN_FRONT
+    closest = np.where(in_front, z - half_z, np.inf)
     low, high = np.empty((2, 2, len(z)))
     axes = ((coords[:, 1], cameras.fx, cameras.cx, half_x), (coords[:, 0], cameras.fy, cameras.cy, half_y))
     for k, (center, focal, principal, half) in enumerate(axes):
+        center = np.where(in_front, center, 0)  # on the camera's plane it is infinite
         extent = (half * float(focal[camera]) + np.abs(center - float(principal[camera])) * half_z) / closest
-        low[k], high[k] = center - extent, center + extent
+        low[k], high[k] = (center - extent) * in_front, (center + extent) * in_front
     return low, high, side
 
 

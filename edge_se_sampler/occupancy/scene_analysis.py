@@ -50,7 +50,7 @@ class SceneAnalysis:
     hit_pixels: list[np.ndarray]
     """(H, W) bool of each view: the pixels whose rays hit the hull, and few others."""
     num_pixels: int
-    """Pixels of all views that show something: as alpha has it, where the hull was carved by that."""
+    """Pixels of all views that are trained on and show something: as alpha has it, where that carved the hull."""
     focus: np.ndarray
     """(5,) float64, as `BrickGrid`'s."""
 
@@ -91,14 +91,20 @@ def analyze_scene(
         hit_pixels = [] if hull is None else find_hit_pixels(views, hull)
     if hull is None:
         raise _nothing_seen(box)
-    shown = (_foreground(image) if i in silhouettes else image[..., 0] >= 0 for i, image in enumerate(views.images))
-    num_pixels = sum(int(mask.sum()) for mask in shown)
+    num_pixels = sum(_count_shown(views, i, bool(silhouettes)) for i in range(len(views.images)))
     point, _ = find_focus(views.cameras)
     distances = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - point, axis=1)
     focus = np.array([*point, near_share, distances.max()])
     return SceneAnalysis(
         box, len(silhouettes), show_whole_object(silhouettes), hull, max_level, hit_pixels, num_pixels, focus
     )
+
+
+def _count_shown(views: Views, view: int, by_alpha: bool) -> int:
+    """Pixels of a view that are trained on and show something: where alpha tells, those that are not transparent."""
+    image = views.images[view]
+    shown = np.ones(image.shape[:2], dtype=bool) if views.masks is None else views.masks[view]
+    return int(np.count_nonzero(shown & _foreground(image) if by_alpha and image.shape[2] == 4 else shown))
 
 
 def _carve_initial(

@@ -93,8 +93,11 @@ def set_initial_camera(server: viser.ViserServer, viewed: Viewed) -> tuple[np.nd
     """Begin at the first training camera, looking at what all of them look at; returns that point (3,), and how far it
     is from them, world units."""
     focus, depth = find_focus(viewed.cameras.to("cpu").to(dtype=torch.float64))
-    scale = max(float(np.median(np.abs(depth))), 1e-9)
     view, start = View.of_training(viewed.cameras, 0), server.initial_camera
+    if not depth.any():  # all look the same way: at what is halfway between near and far
+        depth = np.full(len(depth), sum(viewed.trainer.config.pipeline.model.depths) / 2)
+        focus = view.pose[:, 3] - depth[0] * view.pose[:, 2]
+    scale = max(float(np.median(np.abs(depth))), 1e-9)
     ahead = max(float(depth[0]), 0.1 * scale)
     server.scene.set_up_direction(viewed.up)
     start.position, start.look_at, start.fov = view.pose[:, 3], view.pose[:, 3] - ahead * view.pose[:, 2], view.fov
