@@ -203,6 +203,18 @@ def test_masks_leave_out_what_is_unknown(viewed: Viewed) -> None:
     assert Viewed(tiny_trainer(method_configs()["vanilla-nerf"], VIEWS)).masks is None
 
 
+def test_a_single_camera_looks_at_what_is_halfway_between_near_and_far() -> None:
+    """Its axis alone says nothing of how far that is."""
+    viewed = Viewed(tiny_trainer(config_of(1), VIEWS.subset([0])))
+    camera = SimpleNamespace()
+    server: Any = SimpleNamespace(scene=SimpleNamespace(set_up_direction=lambda _: None), initial_camera=camera)
+    focus, scale = html.set_initial_camera(server, viewed)
+    assert scale == pytest.approx(sum(viewed.trainer.config.pipeline.model.depths) / 2)
+    np.testing.assert_allclose(focus, camera.look_at)
+    assert np.linalg.norm(focus - camera.position) == pytest.approx(scale)
+    assert (camera.near, camera.far) == pytest.approx((0.01 * scale, 100 * scale))
+
+
 def test_an_html_file_begins_behind_the_cameras_that_turn(
     viewed: Viewed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

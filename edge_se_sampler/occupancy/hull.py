@@ -222,7 +222,7 @@ def project_cells(
     for k, (center, focal, principal, half) in enumerate(axes):
         center = np.where(in_front, center, 0)  # on the camera's plane it is infinite
         extent = (half * float(focal[camera]) + np.abs(center - float(principal[camera])) * half_z) / closest
-        low[k], high[k] = (center - extent) * in_front, (center + extent) * in_front
+        low[k], high[k] = center - extent, center + extent
     return low, high, side
 
 
