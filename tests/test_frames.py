@@ -37,6 +37,9 @@ class Wall(torch.nn.Module):
     def chunks(self, num_rays: int) -> list[slice]:
         return [slice(0, num_rays)]
 
+    def find_empty_depths(self, camera: Cameras) -> None:
+        return None
+
     def forward(self, rays: RayBundle) -> dict[str, torch.Tensor]:
         norm = rays.metadata["directions_norm"]
         alpha = torch.full_like(norm, ALPHA)

@@ -22,12 +22,13 @@ class RayBundle:
     metadata: dict[str, Tensor]
     """"directions_norm" (n, 1): length of the direction whose depth along the axis is 1; "pixel_axes" (n, 2, 3): what
     that changes by from a pixel to the one below, and to the one on the right. A host's may have "nears" and "fars"
-    (n, 1): distances from the origin, world units, between which the ray is sampled instead of the model's depths."""
+    (n, 1): distances from the origin, world units, between which the ray is sampled instead of the model's depths. Of
+    a model that knows them, "empty_depths" (n, 1): `RayModel.find_empty_depths`."""
 
     def __len__(self) -> int:
         return len(self.origins)
 
-    def __getitem__(self, rows: slice) -> RayBundle:
+    def __getitem__(self, rows: slice | Tensor) -> RayBundle:
         metadata = {key: value[rows] for key, value in self.metadata.items()}
         return RayBundle(self.origins[rows], self.directions[rows], self.camera_indices[rows], metadata)
 

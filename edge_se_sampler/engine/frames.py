@@ -9,14 +9,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from PIL import Image
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.scene_file import read_json
 from edge_se_sampler.engine.files import make_folder, to_uint8, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import remove_background, render_outputs
+from edge_se_sampler.engine.rendering import CameraRays, remove_background, render_outputs
 from edge_se_sampler.errors import InputError, check_value, os_errors_as_input_errors
 from edge_se_sampler.models.ray_model import RayModel
 
@@ -38,11 +37,11 @@ def render_frame(
     depth         (H, W, 3) uint8: near is red, far is blue, nothing is the background
     raw-depth     (H, W) uint16: depth along the optical axis in depth_unit world units; 0 where nothing is
     """
-    camera = cameras[[index]].to(model.device, torch.float32)
-    size = int(camera.height), int(camera.width)
+    rays = CameraRays.of(model, cameras[[index]])
+    size = int(rays.camera.height), int(rays.camera.width)
     parts = []
     for some in model.chunks(math.prod(size)):  # all rays of a large frame would take many gigabytes
-        rendered = _render_pixels(model, camera.image_rays(0, some), depth_unit)
+        rendered = _render_pixels(model, rays[some], depth_unit)
         parts.append([rendered[name] for name in outputs])
     images = map(np.concatenate, zip(*parts, strict=True))
     return {name: image.reshape(*size, *image.shape[1:]) for name, image in zip(outputs, images, strict=True)}

@@ -31,6 +31,26 @@ class Picture:
         return self.camera.to(device, torch.float32).image_rays(0, pixels)
 
 
+@dataclass(frozen=True)
+class CameraRays:
+    """Rays of one camera's pixels, row by row, with what a model knows of the empty space that they pass."""
+
+    camera: Cameras
+    empty_depths: torch.Tensor | None
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, model: RayModel, camera: Cameras) -> CameraRays:
+        camera = camera.to(model.device, torch.float32)
+        return cls(camera, model.find_empty_depths(camera))
+
+    def __getitem__(self, pixels: slice) -> RayBundle:
+        rays = self.camera.image_rays(0, pixels)
+        if self.empty_depths is not None:
+            rays.metadata["empty_depths"] = self.empty_depths[pixels, None]
+        return rays
+
+
 def to_pictures(views: Views) -> list[Picture]:
     """All views but those of which no pixel is known."""
     masks = (None,) * len(views.names) if views.masks is None else views.masks
@@ -82,8 +102,9 @@ def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torc
 def render_view(model: RayModel, picture: Picture) -> np.ndarray:
     """A view's rendering (H, W, 3) in [0, 1]; FloatingPointError if a rendered value is not finite."""
     height, width = picture.image.shape[:2]
-    chunks = model.chunks(height * width)  # all rays of a photo would take gigabytes
-    parts = [render_rays(model, picture.rays(model.device, pixels)) for pixels in chunks]
+    rays = CameraRays.of(model, picture.camera)
+    # all rays of a photo would take gigabytes
+    parts = [render_rays(model, rays[pixels]) for pixels in model.chunks(height * width)]
     colors = torch.cat(parts).clamp(0, 1)
     _check_finite(colors)
     return colors.reshape(height, width, 3).numpy()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.models.ray_model import RayModel
 
 
@@ -28,6 +28,11 @@ class Ensemble(RayModel):
         outputs = [self._render_member(member, rays) for member in self._models()]
         common = set.intersection(*(set(rendered) for rendered in outputs))
         return {key: torch.stack([rendered[key] for rendered in outputs]).mean(dim=0) for key in sorted(common)}
+
+    def find_empty_depths(self, camera: Cameras) -> Tensor | None:
+        found = [member.find_empty_depths(camera) for member in self._models()]
+        known = [depths for depths in found if depths is not None]
+        return torch.stack(known).amin(dim=0) if len(known) == len(found) else None
 
     def _render_member(self, member: RayModel, rays: RayBundle) -> dict[str, Tensor]:
         """A member's outputs, the background of its depth moved to where this model's config has it."""

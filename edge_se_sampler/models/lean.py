@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.levels import LAST_PRUNING, UNSETTLED, find_level, find_level_end
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
@@ -26,6 +26,7 @@ from edge_se_sampler.models.voxel_backend import choose_ops
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
 from edge_se_sampler.occupancy.saved_grid import MAX_SIZE
+from edge_se_sampler.occupancy.visibility import find_empty_depths
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
 FEATURE_DIM, WIDTH = 16, 64
@@ -132,7 +133,17 @@ class LeanModel(RayModel):
 
     def forward(self, rays: RayBundle) -> dict[str, Tensor]:
         """As `RayModel`; depth_fine in evaluation alone."""
-        return self.render(rays)[0]
+        if "empty_depths" not in rays.metadata:
+            return self.render(rays)[0]
+        some = torch.nonzero(rays.metadata["empty_depths"][:, 0].isfinite())[:, 0]
+        rendered, background = self.render(rays[some])[0], self.get_background(rays)
+        far = self.config.depths[1] * rays.metadata["directions_norm"]
+        nothing = {"rgb_fine": background.clone(), "accumulation_fine": torch.zeros_like(far), "depth_fine": far}
+        outputs = {key: values.index_copy_(0, some, rendered[key]) for key, values in nothing.items()}
+        return outputs | {"background": background}
+
+    def find_empty_depths(self, camera: Cameras) -> Tensor:
+        return find_empty_depths(self.grid, camera)
 
     def training_loss(self, rays: RayBundle, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """As `RayModel`; remembers the largest weight in each cell."""
@@ -188,6 +199,10 @@ class LeanModel(RayModel):
         one, other = -origins * inverse, (self.grid.size - origins) * inverse
         begin = torch.minimum(one, other).amax(dim=1).clamp(min=0).reshape(-1, size).maximum(near)
         end = torch.maximum(one, other).amin(dim=1).reshape(-1, size).minimum(far)
+        if "empty_depths" in rays.metadata:  # whole steps, so that samples are where they would be
+            empty = rays.metadata["empty_depths"] * norm.reshape(-1, size) / cell_size
+            step = self.config.step_size_voxels
+            begin = begin + ((empty - begin) / step).floor().clamp(min=0) * step
         return RaySpans(origins, directions, begin.reshape(-1), end.reshape(-1))
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:

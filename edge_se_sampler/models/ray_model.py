@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from edge_se_sampler import ranks
-from edge_se_sampler.data.cameras import RayBundle
+from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.models.config import ModelConfig
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes
@@ -83,6 +83,11 @@ class RayModel(nn.Module, ABC):
             rgb_NETWORK (n, 3) and accumulation_NETWORK (n, 1) of each network; depth_fine (n, 1), world units along the
             ray; background (n, 3), the colors that the rays are composited on.
         """
+
+    def find_empty_depths(self, camera: Cameras) -> Tensor | None:
+        """Depths along one camera's optical axis, (H W,), world units, before which the rays of a pixel meet nothing;
+        inf: they never do. As "empty_depths" (n, 1) in rays' metadata they make rendering faster. None: not known."""
+        return None
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """All weights, in groups that are optimized differently."""

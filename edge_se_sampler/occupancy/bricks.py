@@ -83,6 +83,8 @@ class BrickGrid(nn.Module):
     sampled: Tensor
     """(K,) int64: bit i is set if the brick's cell i is sampled: all occupied cells, or those of them that are not
     transparent."""
+    sampled_bricks: Tensor
+    """(s, 3) int64: position, in bricks, of each in which a cell is sampled."""
 
     def __init__(
         self,
@@ -200,13 +202,14 @@ class BrickGrid(nn.Module):
         """Sample only some of the occupied cells, see `sampled`."""
         self.register_buffer("sampled", sampled)
         some = sampled != 0
+        self.register_buffer("sampled_bricks", self.bricks[some], persistent=False)
         table = torch.zeros(self.shape, dtype=torch.bool, device=some.device)
-        table[tuple(self.bricks[some].T)] = True
+        table[tuple(self.sampled_bricks.T)] = True
         distance = torch.zeros(self.shape, dtype=torch.int32, device=some.device)
         for _ in range(MAX_DISTANCE):
             distance += ~table
             table = dilate(table)
-        distance.neg_()[tuple(self.bricks[some].T)] = torch.nonzero(some)[:, 0].int()
+        distance.neg_()[tuple(self.sampled_bricks.T)] = torch.nonzero(some)[:, 0].int()
         self.register_buffer("table", distance, persistent=False)
 
     def update_max_weight(self, rows: Tensor, weights: Tensor) -> None:

@@ -66,59 +66,92 @@ class Cells(NamedTuple):
 def march_chunk(rays, first, last, cells, buffers, slot):
     """Enter the samples of rays first .. last - 1 into a slot; returns how many there are, even if there is no room
     for all."""
-    origins, directions, begins, ends, jitters = rays
-    table, neighbors, sampled, density, step, density_scale, density_min, weight_min, transmittance_min = cells
     rows, weights, t, tau = buffers.rows[slot], buffers.weights[slot], buffers.t[slot], buffers.tau[slot]
     light, color_index, sample_ends = buffers.passing[slot], buffers.color_index[slot], buffers.ends[slot]
-    room, steps_per_cell = len(t) - 1, f32(1) / step
+    next_sample, inverse = buffers.next_sample[slot], buffers.inverse[slot]
+    room = len(t) - 1
     m, c = 0, 0
+    _find_first_samples(rays, first, last, cells, next_sample, inverse)
     for i in range(first, last):
-        ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
-        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        begin, end, jitter = begins[i], ends[i], jitters[i]
-        inverse_x, inverse_y, inverse_z = _invert(dx), _invert(dy), _invert(dz)
-        passing, j = f32(1), 0
-        while True:
-            s = begin + (f32(j) + jitter) * step
-            if not s < end:
-                break
-            x, y, z = ox + s * dx, oy + s * dy, oz + s * dz
-            ix, iy, iz = int(x), int(y), int(z)
-            j += 1
-            brick = table[ix >> 2, iy >> 2, iz >> 2]
-            if brick < 0:
-                leave = min(
-                    _leave(ix >> 2, -brick, ox, inverse_x),
-                    _leave(iy >> 2, -brick, oy, inverse_y),
-                    _leave(iz >> 2, -brick, oz, inverse_z),
-                )
-                # rounded down, and one less: rounding must not skip a cell
-                j = max(j, int((leave - begin) * steps_per_cell - jitter))
-                continue
-            cell = ((ix & 3) << 4) | ((iy & 3) << 2) | (iz & 3)
-            if not (sampled[brick] >> cell) & 1:
+        ray = i - first
+        passing, j = f32(1), next_sample[ray]
+        while j >= 0:
+            s, x, y, z, brick, cell, following = _find_cell(rays, i, cells, inverse, 3 * ray, j)
+            j = following
+            if cell < 0:
                 continue
             k = min(m, room)  # beyond the capacity, samples are only counted
-            _set_weights(x - f32(ix), y - f32(iy), z - f32(iz), weights, 8 * k)
+            _set_weights(x, y, z, weights, 8 * k)
             raw = f32(0)
             for corner in range(8):
-                row = neighbors[brick, NEIGHBOR[cell, corner]] * 64 + CORNER[cell, corner]
+                row = cells.neighbors[brick, NEIGHBOR[cell, corner]] * 64 + CORNER[cell, corner]
                 rows[8 * k + corner] = row
-                raw += weights[8 * k + corner] * density[row]
-            if raw > density_min:
-                t[k], tau[k], light[k], color_index[k] = s, math.exp(raw) * density_scale, passing, -1
+                raw += weights[8 * k + corner] * cells.density[row]
+            if raw > cells.density_min:
+                t[k], tau[k], light[k], color_index[k] = s, math.exp(raw) * cells.density_scale, passing, -1
                 transparency = math.exp(-tau[k])
-                if passing * (f32(1) - transparency) > weight_min:
+                if passing * (f32(1) - transparency) > cells.weight_min:
                     color_index[k] = min(c, room)
                     c += 1
                 m += 1
                 passing *= transparency
-                if passing < transmittance_min:
+                if passing < cells.transmittance_min:
                     break
-        sample_ends[i - first] = m
+        sample_ends[ray] = m
     sample_ends[last - first :] = m
     buffers.num_colored[slot] = c
     return m
+
+
+@njit(cache=True, error_model="numpy")
+def _find_first_samples(rays, first, last, cells, next_sample, inverse):
+    """The number of each ray's first sample in a cell that is sampled; -1: it has none. Rays take turns, so that the
+    processor follows several of them at once: on one, each step waits for what is found at the step before."""
+    num_active, active = last - first, np.arange(last - first)
+    for ray in range(num_active):
+        next_sample[ray] = 0
+        for axis in range(3):
+            inverse[3 * ray + axis] = _invert(rays.directions[first + ray, axis])
+    while num_active > 0:
+        kept = 0
+        for number in range(num_active):
+            ray = active[number]
+            cell, following = _find_cell(rays, first + ray, cells, inverse, 3 * ray, next_sample[ray])[-2:]
+            if cell < 0:
+                next_sample[ray] = following
+                active[kept] = ray
+                kept += following >= 0
+        num_active = kept
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _find_cell(rays, i, cells, inverse, axis, j):
+    """Where sample j of ray i is: its distance on the ray, its position in its cell, number of the brick and of the
+    cell, -1 if it is not sampled; and which sample is next, -1 beyond the end."""
+    steps_per_cell = f32(1) / cells.step
+    ox, oy, oz = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
+    s = rays.begin[i] + (f32(j) + rays.jitter[i]) * cells.step
+    if not s < rays.end[i]:
+        return s, f32(0), f32(0), f32(0), -1, -1, -1
+    x = ox + s * rays.directions[i, 0]
+    y = oy + s * rays.directions[i, 1]
+    z = oz + s * rays.directions[i, 2]
+    ix, iy, iz = int(x), int(y), int(z)
+    brick = int(cells.table[ix >> 2, iy >> 2, iz >> 2])
+    cell = ((ix & 3) << 4) | ((iy & 3) << 2) | (iz & 3)
+    j += 1
+    if brick < 0:
+        leave = min(
+            _leave(ix >> 2, -brick, ox, inverse[axis]),
+            _leave(iy >> 2, -brick, oy, inverse[axis + 1]),
+            _leave(iz >> 2, -brick, oz, inverse[axis + 2]),
+        )
+        cell = -1
+        # rounded down, and one less: rounding must not skip a cell
+        j = max(j, int((leave - rays.begin[i]) * steps_per_cell - rays.jitter[i]))
+    elif not (cells.sampled[brick] >> cell) & 1:
+        cell = -1
+    return s, x - f32(ix), y - f32(iy), z - f32(iz), brick, cell, j
 
 
 @njit(cache=True, inline="always")
