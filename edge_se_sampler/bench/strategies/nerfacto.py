@@ -50,8 +50,9 @@ OF_BLENDER_SCENES = {
     "model.distortion-loss-mult": 0,
 }
 """With `OF_OBJECTS`, what nerfstudio's own benchmark sets for NeRF's Blender scenes, too."""
-LEARNING_RATES = {"optimizers.fields.optimizer.lr": 3e-3, "optimizers.proposal-networks.optimizer.lr": 3e-3}
-"""Flags; with nerfstudio's own, 1e-2, so few rays a step often end in one color everywhere."""
+RATES_OF_OBJECTS = {"optimizers.fields.optimizer.lr": 3e-3, "optimizers.proposal-networks.optimizer.lr": 3e-3}
+"""Flags; with nerfstudio's own, 1e-2, so few rays a step often end in one color everywhere. Captures do not, and learn
+faster with it."""
 NEVER = 10**9
 
 
@@ -92,7 +93,7 @@ def nerfacto_config(trial: Trial, settings: Settings, data: Path, folder: Path, 
     """nerfstudio's config of a trial."""
     is_blender = trial.placement == "shifted" or not (data / "transforms.json").exists()
     flags = SMALL | (OF_OBJECTS if is_object else {}) | (OF_BLENDER_SCENES if is_blender else {})
-    flags = {f"pipeline.{name}": value for name, value in flags.items()} | LEARNING_RATES
+    flags = {f"pipeline.{name}": value for name, value in flags.items()} | (RATES_OF_OBJECTS if is_object else {})
     arguments = [text for name, value in flags.items() for text in (f"--{name}", str(value))]
     config = build_config("edge-se-nerfacto", trial.seed, data, folder, arguments)
     if trial.placement == "shifted":
