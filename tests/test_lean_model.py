@@ -17,6 +17,7 @@ from edge_se_sampler.engine.rendering import render_outputs
 from edge_se_sampler.models import voxel_backend
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import INITIAL_DEPTH_CARVED, INITIAL_RAW_DENSITY, LeanModel
+from edge_se_sampler.models.ray_spans import find_spans
 from edge_se_sampler.occupancy.bricks import BrickGrid
 
 
@@ -78,7 +79,7 @@ def test_rays_begin_at_a_share_of_the_way_to_the_focus(share: float, expected: t
     directions = torch.nn.functional.normalize(9 - origins, dim=1)
     norm = {"directions_norm": torch.ones(3, 1)}
     rays = RayBundle(origins, directions, torch.zeros((3, 1), dtype=torch.int64), norm)
-    spans = model._spans(rays, 1)
+    spans = find_spans(rays, 1, model.grid, model.config.depths, 1.0)
     begin = spans.begin * float(model.grid.cell_size)
     torch.testing.assert_close(begin, torch.tensor(expected))
 
@@ -89,7 +90,7 @@ def test_rays_along_the_boxs_side_lie_in_it(component: float) -> None:
     model = full_model()
     ray = torch.tensor([[-1.0, 0.5, 3.0]]), torch.tensor([[component, 0.0, -1.0]])
     rays = RayBundle(*ray, torch.zeros((1, 1), dtype=torch.int64), {"directions_norm": torch.ones(1, 1)})
-    spans = model._spans(rays, 1)
+    spans = find_spans(rays, 1, model.grid, model.config.depths, 1.0)
     assert [float(x) * float(model.grid.cell_size) for x in (spans.begin, spans.end)] == pytest.approx([2.0, 4.0])
 
 

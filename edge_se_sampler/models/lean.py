@@ -22,10 +22,10 @@ from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.levels import LAST_PRUNING, UNSETTLED, find_level, find_level_end
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
+from edge_se_sampler.models.ray_spans import find_spans
 from edge_se_sampler.models.voxel_backend import choose_ops
-from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, RaySpans, Rendered
+from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
-from edge_se_sampler.occupancy.saved_grid import MAX_SIZE
 from edge_se_sampler.occupancy.visibility import find_empty_depths
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
@@ -167,7 +167,8 @@ class LeanModel(RayModel):
     def render(self, rays: RayBundle) -> tuple[dict[str, Tensor], Rendered]:
         """Outputs of `forward`, and what they were made of."""
         size = 4 if self.supersampled else 1
-        spans, jitter = self._spans(rays, size), self.uniform(len(rays), size).reshape(-1) if self.training else None
+        spans = find_spans(rays, size, self.grid, self.config.depths, self.config.step_size_voxels)
+        jitter = self.uniform(len(rays), size).reshape(-1) if self.training else None
         weights = self.density, self.features, self.fine.weights()
         rendered = choose_ops(self.density).render(self.grid, *weights, spans, jitter, self.marching)
         of_rays = rendered.rgb, rendered.accumulation, rendered.distance
@@ -179,31 +180,6 @@ class LeanModel(RayModel):
             depth = distance * float(self.grid.cell_size)
             outputs["depth_fine"] = depth + passing * self.config.depths[1] * rays.metadata["directions_norm"]
         return outputs | {"background": background}, rendered
-
-    def _spans(self, rays: RayBundle, size: int) -> RaySpans:
-        """Rays in units of cells, 1 or 4 through each pixel, from where they enter the box, or the near depth or what
-        is empty ends, to where they leave it."""
-        cell_size = float(self.grid.cell_size)
-        whole = rays.directions, rays.metadata["directions_norm"]
-        directions, norm = (x.reshape(-1, x.shape[-1]) for x in (rays.split_pixels() if size > 1 else whole))
-        of_pixels = self.grid.to_cell_units(rays.origins).to(self.dtype)
-        if "nears" in rays.metadata:
-            near, far = (rays.metadata[name] / cell_size for name in ("nears", "fars"))
-        else:
-            (nearest, farthest), scale = self.config.depths, norm.reshape(-1, size) / cell_size
-            near, far = self.grid.empty_depth(rays.origins).clamp(min=nearest)[:, None] * scale, farthest * scale
-        # from farther away float32 does not know the cell, and compiled kernels would look for it outside of the grid
-        far = torch.where((of_pixels.abs() < MAX_SIZE).all(dim=1, keepdim=True), far, 0)
-        origins = of_pixels[:, None].expand(-1, size, 3).reshape(-1, 3)  # copies nothing where a pixel has one ray
-        inverse = 1 / torch.where(directions.abs() < 1e-12, 1e-12, directions)
-        one, other = -origins * inverse, (self.grid.size - origins) * inverse
-        begin = torch.minimum(one, other).amax(dim=1).clamp(min=0).reshape(-1, size).maximum(near)
-        end = torch.maximum(one, other).amin(dim=1).reshape(-1, size).minimum(far)
-        if "empty_depths" in rays.metadata:  # whole steps, so that samples are where they would be
-            empty = rays.metadata["empty_depths"] * norm.reshape(-1, size) / cell_size
-            step = self.config.step_size_voxels
-            begin = begin + ((empty - begin) / step).floor().clamp(min=0) * step
-        return RaySpans(origins, directions, begin.reshape(-1), end.reshape(-1))
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Prunes and subdivides cells, by the part of the training that is done; now and then finds those that have
