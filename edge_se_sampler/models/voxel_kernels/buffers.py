@@ -18,7 +18,7 @@ class Buffers(NamedTuple):
     """S slots with room for M samples of CHUNK rays, of which as many may have a color. Of a slot, all that has several
     numbers for each sample or ray is flat."""
 
-    next_sample: np.ndarray  # (S, CHUNK) int32: of each ray, while it is marched; -1: none
+    next_sample: np.ndarray  # (S, CHUNK) int64: of each ray, while it is marched; -1: none
     inverse: np.ndarray  # (S, 3 CHUNK): 1 / direction
     ends: np.ndarray  # (S, CHUNK) int32: end of each ray's samples
     num_colored: np.ndarray  # (S,) int32
@@ -44,7 +44,7 @@ class Buffers(NamedTuple):
             return np.empty((slots, *size), dtype)
 
         return cls(
-            next_sample=empty(CHUNK, dtype=np.int32),
+            next_sample=empty(CHUNK, dtype=np.int64),
             inverse=empty(3 * CHUNK),
             ends=empty(CHUNK, dtype=np.int32),
             num_colored=empty(dtype=np.int32),

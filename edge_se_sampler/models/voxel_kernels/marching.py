@@ -125,9 +125,9 @@ def _find_first_samples(rays, first, last, cells, next_sample, inverse):
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _find_cell(rays, i, cells, inverse, axis, j):
-    """Where sample j of ray i is: its distance on the ray, its position in its cell, number of the brick and of the
-    cell, -1 if it is not sampled; and which sample is next, -1 beyond the end."""
+def _find_cell(rays, i, cells, inverse, k, j):
+    """Where sample j of ray i, of direction 1 / inverse[k:], is: its distance on the ray, its position in its cell,
+    number of the brick and of the cell, -1 if it is not sampled; and which sample is next, -1 beyond the end."""
     steps_per_cell = f32(1) / cells.step
     ox, oy, oz = rays.origins[i, 0], rays.origins[i, 1], rays.origins[i, 2]
     s = rays.begin[i] + (f32(j) + rays.jitter[i]) * cells.step
@@ -142,9 +142,9 @@ def _find_cell(rays, i, cells, inverse, axis, j):
     j += 1
     if brick < 0:
         leave = min(
-            _leave(ix >> 2, -brick, ox, inverse[axis]),
-            _leave(iy >> 2, -brick, oy, inverse[axis + 1]),
-            _leave(iz >> 2, -brick, oz, inverse[axis + 2]),
+            _leave(ix >> 2, -brick, ox, inverse[k]),
+            _leave(iy >> 2, -brick, oy, inverse[k + 1]),
+            _leave(iz >> 2, -brick, oz, inverse[k + 2]),
         )
         cell = -1
         # rounded down, and one less: rounding must not skip a cell
