@@ -26,9 +26,9 @@ class Picture:
     mask: np.ndarray | None = None
     """(H, W) bool: the pixels that are known; None: all."""
 
-    def rays(self, device: torch.device, pixels: slice = slice(None)) -> RayBundle:
-        """The H * W rays of its pixels, row by row, or some of them."""
-        return self.camera.to(device, torch.float32).image_rays(0, pixels)
+    def rays(self, device: torch.device) -> RayBundle:
+        """The H * W rays of its pixels, row by row."""
+        return self.camera.to(device, torch.float32).image_rays(0)
 
 
 @dataclass(frozen=True)

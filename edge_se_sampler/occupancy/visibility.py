@@ -46,8 +46,8 @@ def find_empty_depths(grid: BrickGrid, camera: Cameras) -> Tensor:
 
 
 def _project(grid: BrickGrid, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """Rectangles of the bricks that are sampled and not behind the depth at which the camera's rays begin: least and
-    greatest x, y in pixels, (2, k), and least depth (k,)."""
+    """Rectangles of the bricks in which a cell is sampled: least and greatest x, y in pixels, (2, k), and least depth,
+    (k,); inf where a brick ends before the camera's rays begin."""
     pose, size = camera.camera_to_worlds[0], BRICK * float(grid.cell_size)
     begin = float(grid.empty_depth(pose[None, :, 3]))
     centers = (grid.sampled_bricks + 0.5) * size + (grid.aabb_min.to(pose) - pose[:, 3])
@@ -55,16 +55,12 @@ def _project(grid: BrickGrid, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
     half_x, half_y, half_z = size / 2 * pose[:, :3].abs().sum(dim=0)
     near = (-half_z - back).clamp(min=max(begin, size * EXACTNESS))
     far = half_z - back
-    is_before, far = far > begin, far.maximum(near)
+    is_sampled, far = far > begin, far.maximum(near)
     edges = []
     for center, half, focal, principal in ((right, half_x, camera.fx, camera.cx), (-up, half_y, camera.fy, camera.cy)):
         low, high = center - half, center + half
         # seen at the greatest angle where it is nearest, but for what is beyond the optical axis
-        edges.append(
-            (
-                principal[0] + focal[0] * torch.minimum(low / near, low / far) - MARGIN,
-                principal[0] + focal[0] * torch.maximum(high / near, high / far) + MARGIN,
-            )
-        )
+        slopes = torch.minimum(low / near, low / far), torch.maximum(high / near, high / far)
+        edges.append([principal[0] + focal[0] * slope + m for slope, m in zip(slopes, (-MARGIN, MARGIN), strict=True)])
     low, high = (torch.stack(edge) for edge in zip(*edges, strict=True))
-    return low, high, torch.where(is_before, near * (1 - EXACTNESS), torch.inf)
+    return low, high, torch.where(is_sampled, near * (1 - EXACTNESS), torch.inf)
