@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from edge_se_sampler.occupancy.bricks import BRICK, MAX_DISTANCE, OFFSETS, BrickGrid, dilate, unpack_bits
+from edge_se_sampler.occupancy.subdivision import subdivide
 
 
 def random_cells(share: float = 0.02, shape: tuple[int, int, int] = (21, 9, 14)) -> torch.Tensor:
@@ -70,7 +71,7 @@ def test_smaller_cells_and_a_state_keep_the_focus_which_earlier_versions_lack() 
     cells, focus = random_cells(), torch.tensor([1.0, 2.0, 3.0, 0.45, 9.0], dtype=torch.float64)
     grid = BrickGrid.from_cells(torch.zeros(3), 0.5, cells, 2, focus=focus)
     state = grid.state_dict()
-    for other in (grid.subdivide(cells, 0.25), BrickGrid.from_state(state)):
+    for other in (subdivide(grid, cells, 0.25), BrickGrid.from_state(state)):
         assert torch.equal(other.focus, focus)
     del state["focus"]
     before = BrickGrid.from_state(state)
@@ -92,7 +93,7 @@ def test_the_table_has_bricks_or_the_distance_to_the_next() -> None:
 def test_smaller_cells_are_those_in_and_next_to_what_is_kept(ratio: float) -> None:
     cells = random_cells(0.1)
     kept = cells & random_cells(0.5)
-    finer = grid_of(cells).subdivide(kept, 0.5 * ratio)
+    finer = subdivide(grid_of(cells), kept, 0.5 * ratio)
     size = torch.ceil(torch.tensor(cells.shape) / ratio - 1e-6).long().tolist()
     assert finer.size.tolist() == size
     axes = [
@@ -106,7 +107,7 @@ def test_smaller_cells_are_those_in_and_next_to_what_is_kept(ratio: float) -> No
 
 
 def test_a_grid_from_its_state_is_the_same_and_of_the_same_scene() -> None:
-    grid = grid_of(random_cells()).subdivide(random_cells(), 0.2)
+    grid = subdivide(grid_of(random_cells()), random_cells(), 0.2)
     grid.update_max_weight(torch.tensor([3, 5, 3]), torch.tensor([0.5, 0.25, 0.75]))
     again = BrickGrid.from_state(grid.state_dict())
     for name, value in (*grid.state_dict().items(), ("table", grid.table), ("neighbors", grid.neighbors)):

@@ -22,6 +22,7 @@ from edge_se_sampler.models.lean import ColorNetwork
 from edge_se_sampler.models.voxel_kernels import rendering
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
+from edge_se_sampler.occupancy.subdivision import subdivide
 
 MARCHING = Marching(0.7, 1.0, 0.012, 0.006, 0.01, 0.4)
 VIEWS = ball_views()
@@ -230,7 +231,7 @@ def test_finer_corners_have_the_values_around_them(ops: ModuleType, ratio: float
         return (4 * of.bricks[:, None] + in_brick).reshape(-1, 3) * of.cell_size
 
     slope = random_tensor(3, 1).double()
-    finer = grid.subdivide(occupied, ratio)
+    finer = subdivide(grid, occupied, ratio)
     values = torch.cat((positions(grid) @ slope, positions(grid)), dim=1).float()
     found = ops.resample(finer.bricks, ratio, grid.numbers, values)
     brick, cell = torch.nonzero(finer.occupied, as_tuple=True)

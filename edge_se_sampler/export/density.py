@@ -15,6 +15,7 @@ from edge_se_sampler.models.nerf import NeRFModel
 from edge_se_sampler.models.ray_model import RayModel
 from edge_se_sampler.models.voxel_ops import find_dense_cells
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
+from edge_se_sampler.occupancy.subdivision import subdivide
 
 MAX_ROWS = 2**23
 """Of the bricks of cells for which a dense network is evaluated: more would take long."""
@@ -40,7 +41,7 @@ def find_density(model: RayModel, opacity: float, find_box: Callable[[], BrickGr
         if grid.level == grid.max_level:
             return grid, difference
         dense = unpack_bits(find_dense_cells(grid, difference[:, None], 0.0)).reshape(-1)
-        finer = grid.subdivide(grid.to_cells(dense), float(grid.cell_size) / 2)
+        finer = subdivide(grid, grid.to_cells(dense), float(grid.cell_size) / 2)
         if finer.num_rows > MAX_ROWS:
             return grid, difference
         grid = finer

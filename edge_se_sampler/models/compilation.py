@@ -13,6 +13,7 @@ from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import LeanModel
 from edge_se_sampler.models.voxel_backend import compiled_ops
 from edge_se_sampler.occupancy.bricks import BrickGrid
+from edge_se_sampler.occupancy.subdivision import subdivide
 
 
 def compile_ops(device: str) -> None:
@@ -32,6 +33,6 @@ def compile_ops(device: str) -> None:
         rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
         ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
         ops.find_dense_cells(grid, weight.data, 0.0)
-        ops.resample(grid.subdivide(cells, 0.5).bricks, 0.5, grid.numbers, weight.data)
+        ops.resample(subdivide(grid, cells, 0.5).bricks, 0.5, grid.numbers, weight.data)
     if time.monotonic() - began > 5:
         print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)

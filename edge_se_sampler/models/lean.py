@@ -26,6 +26,7 @@ from edge_se_sampler.models.ray_spans import find_spans
 from edge_se_sampler.models.voxel_backend import choose_ops
 from edge_se_sampler.models.voxel_ops import NUM_HARMONICS, Marching, NetworkWeights, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
+from edge_se_sampler.occupancy.subdivision import subdivide
 from edge_se_sampler.occupancy.visibility import find_empty_depths
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
@@ -286,7 +287,7 @@ class LeanModel(RayModel):
         grid, ratio = self.grid, 0.5
         assert self.config.max_memory is not None  # the config is resolved
         most = self.config.max_memory * 2**30 / BYTES_PER_ROW
-        finer = grid.subdivide(kept, float(grid.cell_size) / 2)
+        finer = subdivide(grid, kept, float(grid.cell_size) / 2)
         later = int(grid.max_level - grid.level) - 1
         if later and ratio * (finer.num_rows * ROWS_RATIO**later / most) ** 0.4 > MAX_RATIO:
             return None
@@ -300,7 +301,7 @@ class LeanModel(RayModel):
             if 0.95 < better / ratio < 1.05:
                 break
             ratio = better
-            finer = grid.subdivide(kept, ratio * float(grid.cell_size))
+            finer = subdivide(grid, kept, ratio * float(grid.cell_size))
         return finer
 
 

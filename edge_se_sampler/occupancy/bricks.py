@@ -9,7 +9,6 @@ row    of a cell, and of the values at its least corner: 64 * brick + 16 x + 4 y
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -275,48 +274,6 @@ class BrickGrid(nn.Module):
         inside = brick >= 0
         x, y, z = (cell[inside] % BRICK).unbind(dim=1)
         return inside.masked_scatter(inside, self.occupied[brick[inside], (x * BRICK + y) * BRICK + z])
-
-    def subdivide(self, kept: Tensor, cell_size: float) -> BrickGrid:
-        """The same box in smaller cells, of at least h / 4. Occupied are those whose center is in an occupied cell, and
-        that are in, or next to one in, cells (X, Y, Z) bool that are kept."""
-        ratio = cell_size / float(self.cell_size)
-        size = torch.ceil(self.size / ratio - 1e-6).long()
-        bricks, occupied = self._find_bricks(kept, ratio, size), []
-        parents = self.to_cells(self.occupied.reshape(-1))
-        window = torch.arange(-1, BRICK + 1, device=kept.device)  # a brick's cells along an axis, and one around
-        for some in bricks.split(2**13):
-            cells = BRICK * some[:, None] + window[:, None]
-            parent = torch.minimum(((cells.clamp(min=0) + 0.5) * ratio).long(), self.size - 1)
-            x, y, z = parent.unbind(dim=2)
-            where = x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]
-            around = kept[where]
-            for axis in (1, 2, 3):
-                lower, middle, upper = (around.narrow(axis, i, BRICK) for i in range(3))
-                around = lower | middle | upper
-            inner = (parents[where] & _in_box(cells, size))[:, 1:-1, 1:-1, 1:-1]
-            occupied.append((around & inner).flatten(1))
-        occupied = torch.cat(occupied)
-        some = occupied.any(dim=1)
-        scene = int(self.max_level), int(self.num_pixels), self.focus
-        finer = BrickGrid(self.aabb_min, cell_size, size.tolist(), bricks[some], occupied[some], *scene).to(kept.device)
-        finer.level, finer.finest_size, finer.scene = self.level + 1, self.finest_size, self.scene
-        return finer
-
-    def _find_bricks(self, kept: Tensor, ratio: float, size: Tensor) -> Tensor:
-        """(k, 3) positions of the bricks of smaller cells, see `subdivide`, in which some may be occupied."""
-        found = torch.zeros((size // BRICK + 1).tolist(), dtype=torch.bool, device=kept.device)
-        cells = torch.nonzero(kept)
-        first, last = (cells / ratio).long() - 1, ((cells + 1) / ratio).long() + 1  # at most seven, in three bricks
-        ends = [torch.minimum(end.clamp(min=0), size - 1) // BRICK for end in (first, (first + last) // 2, last)]
-        for x, y, z in itertools.product(ends, repeat=3):
-            found[x[:, 0], y[:, 1], z[:, 2]] = True
-        return torch.nonzero(found)
-
-
-def _in_box(cells: Tensor, size: Tensor) -> Tensor:
-    """(k, n, n, n) bool: cells of the coordinates (k, n, 3) along each axis that are not beyond a size (3,)."""
-    x, y, z = (cells < size).unbind(dim=2)
-    return x[:, :, None, None] & y[:, None, :, None] & z[:, None, None, :]
 
 
 def _corner_table() -> Tensor:
