@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,11 +52,33 @@ def test_who_has_waited_longest_has_the_next_turn() -> None:
     with turns:
         for count, thread in enumerate(threads):
             thread.start()
-            wait_until(lambda count=count: turns._next == count + 2)
+            wait_until(lambda count=count: len(turns._waiting) == count + 2)
     for thread in threads:
         thread.join()
     assert order[:2] == ["training", "viewer"]
     assert order.count("viewer") == 3
+
+
+def test_who_gives_up_waiting_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    turns, order = Turns(), []
+
+    def give_up(_: object) -> None:
+        raise KeyboardInterrupt
+
+    def take() -> None:
+        with turns:
+            order.append("next")
+
+    with turns:
+        with monkeypatch.context() as patch:
+            patch.setattr(turns._changed, "wait_for", give_up)
+            with pytest.raises(KeyboardInterrupt):
+                take()
+        thread = threading.Thread(target=take, daemon=True)
+        thread.start()
+        wait_until(lambda: len(turns._waiting) == 2)
+    thread.join(timeout=10)
+    assert order == ["next"]
 
 
 def test_pictures_fit_the_measured_pace_and_grow_to_the_full_height() -> None:
@@ -107,6 +130,15 @@ def test_outputs_are_pictures(viewed: Viewed, output: str) -> None:
     assert picture.shape == (16, 16, 3)
     assert picture.dtype == np.uint8
     assert picture.std() > 1
+
+
+def test_depths_are_those_of_what_is_seen_whatever_is_behind(viewed: Viewed) -> None:
+    model, camera = viewed.model, View.of_training(viewed.cameras, 0).camera(16)
+    pictures = []
+    for far in (model.config.depths[1], 1000.0):
+        model.config = replace(model.config, far=far)
+        pictures.append(Renderer(viewed).picture(camera, "depth", lambda: False))
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_a_view_of_a_training_camera_has_its_rays() -> None:

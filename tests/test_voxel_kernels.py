@@ -81,6 +81,13 @@ def test_the_same_samples_have_colors(step: float) -> None:
         assert_close(getattr(found, name), value)
 
 
+@pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
+def test_samples_without_a_color_count_in_a_ray_s_distance(ops: ModuleType) -> None:
+    all_colored, few_colored = (render(ops, replace(MARCHING, weight_min=least)) for least in (0.0, 0.2))
+    assert len(few_colored.cells) < len(all_colored.cells) / 2
+    assert_close(few_colored.distance, all_colored.distance, 1e-6)
+
+
 def test_rays_end_where_no_light_passes() -> None:
     whole, early = (
         render(voxel_kernels, replace(MARCHING, transmittance_min=least)).accumulation.detach() for least in (0.0, 0.5)

@@ -49,18 +49,18 @@ def resident_memory(what: str = "VmRSS") -> int:
     return peak if platform.system() == "Darwin" else peak * 1024
 
 
-def median_milliseconds(cases: Mapping[str, Callable[[int], Any]], rounds: int, warmup: int = 1) -> dict[str, float]:
-    """Of every case (name -> function of the round's number), over the rounds after those of warmup. Cases take turns,
+def median_milliseconds(cases: Mapping[str, Callable[[int], Any]], rounds: int) -> dict[str, float]:
+    """Of every case (name -> function of the round's number), over the rounds after a first one. Cases take turns,
     so that a machine whose speed drifts is fair to all of them."""
     seconds: dict[str, list[float]] = {name: [] for name in cases}
-    with Progress(warmup + rounds, "timing") as progress:
-        for number in range(warmup + rounds):
+    with Progress(1 + rounds, "timing") as progress:
+        for number in range(1 + rounds):
             for name, case in cases.items():
                 start = time.perf_counter()
                 case(number)
                 seconds[name].append(time.perf_counter() - start)
             progress.update(number + 1)
-    return {name: 1e3 * statistics.median(values[warmup:]) for name, values in seconds.items()}
+    return {name: 1e3 * statistics.median(values[1:]) for name, values in seconds.items()}
 
 
 def _read_proc(file: str, key: str) -> str | None:

@@ -93,6 +93,10 @@ class Cameras:
         intrinsics = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
         return replace(self, **intrinsics, width=self.width // factor, height=self.height // factor)
 
+    def find_distances(self, point: np.ndarray) -> np.ndarray:
+        """(n,) float64: how far each camera is from a point (3,), world units."""
+        return np.linalg.norm(self.camera_to_worlds[:, :, 3].cpu().numpy() - point, axis=1)
+
     def generate_rays(self, camera_indices: Tensor, coords: Tensor) -> RayBundle:
         """A ray through each of coords (n, 2), float y, x in pixels, of the cameras (n, 1) int64, or of one (1, 1)."""
         c, n = camera_indices[:, 0], len(coords)

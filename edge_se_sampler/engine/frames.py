@@ -15,7 +15,7 @@ from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.scene_file import read_json
 from edge_se_sampler.engine.files import make_folder, to_uint8, write_image, write_json
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.engine.rendering import CameraRays, remove_background, render_outputs
+from edge_se_sampler.engine.rendering import CameraRays, find_surfaces, render_outputs
 from edge_se_sampler.errors import InputError, check_value, os_errors_as_input_errors
 from edge_se_sampler.models.ray_model import RayModel
 
@@ -53,7 +53,7 @@ def _render_pixels(model: RayModel, rays: RayBundle, depth_unit: float) -> dict[
     keys = ("rgb_fine", "accumulation_fine", "depth_fine", "background")
     outputs = render_outputs(model, rays, keys)
     norm = rays.metadata["directions_norm"].cpu()
-    colors, distance = (x.numpy() for x in remove_background(outputs, far * norm))
+    colors, distance = (x.numpy() for x in find_surfaces(outputs, far * norm))
     rgb, alpha, background = (outputs[key].numpy() for key in (keys[0], keys[1], keys[3]))
     alpha = alpha.clip(0, 1)
     depth = (distance / norm.numpy()).astype(np.float64).clip(near, far)

@@ -70,7 +70,7 @@ def _findings(views: Views, analysis: SceneAnalysis, config: LeanModelConfig, de
     assert config.max_memory is not None  # the config is resolved
     # large cells may reach beyond the box
     num_cells = max(hull.cells.size, (2 * box.half_extent / hull.cell_size) ** 3)
-    distance = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - box.center, axis=1)
+    distance = views.cameras.find_distances(box.center)
     center = ", ".join(f"{value + 0.0:.2f}" for value in box.center.round(2))
     part = config.near_share
     nearer = f"; nothing nearer than {100 * part:g} % of the way to what a view looks at" if part else ""

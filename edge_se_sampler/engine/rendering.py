@@ -12,6 +12,7 @@ from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.models.rendering import remove_background
 from edge_se_sampler.sampling.edges import unit_float
 
 
@@ -20,11 +21,16 @@ class Picture:
     """An image that a rendering is compared with, and the camera that took it."""
 
     name: str
-    image: np.ndarray
-    """(H, W, 3|4) float32 in [0, 1], straight alpha."""
+    stored: np.ndarray
+    """(H, W, 3|4) uint8 or float in [0, 1], straight alpha."""
     camera: Cameras  # one
     mask: np.ndarray | None = None
     """(H, W) bool: the pixels that are known; None: all."""
+
+    @property
+    def image(self) -> np.ndarray:
+        """(H, W, 3|4) float32 in [0, 1], straight alpha: of many pictures too much to be kept."""
+        return unit_float(self.stored)
 
     def rays(self, device: torch.device) -> RayBundle:
         """The H * W rays of its pixels, row by row."""
@@ -55,7 +61,7 @@ def to_pictures(views: Views) -> list[Picture]:
     """All views but those of which no pixel is known."""
     masks = (None,) * len(views.names) if views.masks is None else views.masks
     return [
-        Picture(name, unit_float(views.images[i]), views.cameras[[i]], mask)
+        Picture(name, views.images[i], views.cameras[[i]], mask)
         for i, (name, mask) in enumerate(zip(views.names, masks, strict=True))
         if mask is None or mask.any()
     ]
@@ -74,24 +80,22 @@ def render_outputs(model: RayModel, rays: RayBundle, keys: Collection[str]) -> d
     return {key: torch.cat([chunk[key] for chunk in chunks]) for key in keys}
 
 
-def remove_background(outputs: Mapping[str, torch.Tensor], far: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of n rays' outputs (on the CPU, with rgb_fine, accumulation_fine, depth_fine and background), what they would be
-    without the background behind: colors (n, 3) in [0, 1] and distances (n, 1), world units, both means over what is
-    seen; of no meaning where that is nothing. far: (n, 1) distances at which the background counts.
-    FloatingPointError if one is not finite."""
+def find_surfaces(outputs: Mapping[str, torch.Tensor], far: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of n rays' outputs (on the CPU, with rgb_fine, accumulation_fine, depth_fine and background), colors (n, 3) in
+    [0, 1] and distances (n, 1), world units, of what is in front of the background; of no meaning where that is
+    nothing. far: (n, 1) distances at which the background counts. FloatingPointError if one is not finite."""
     opacity = outputs["accumulation_fine"]
-    passing, opaque = 1 - opacity, opacity.clamp(min=1e-3)
-    colors = ((outputs["rgb_fine"] - passing * outputs["background"]) / opaque).clamp(0, 1)
-    distance = (outputs["depth_fine"] - passing * far) / opaque
+    colors = remove_background(outputs["rgb_fine"], opacity, outputs["background"]).clamp(0, 1)
+    distance = remove_background(outputs["depth_fine"], opacity, far)
     _check_finite(colors, distance)
     return colors, distance
 
 
 def render_opaque(model: RayModel, rays: RayBundle) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Colors and distances of n rays as `remove_background`, and the accumulated opacity (n, 1)."""
+    """Colors and distances of n rays as `find_surfaces`, and the accumulated opacity (n, 1)."""
     outputs = render_outputs(model, rays, ("rgb_fine", "accumulation_fine", "depth_fine", "background"))
     far = model.config.depths[1] * rays.metadata["directions_norm"].cpu()
-    return *remove_background(outputs, far), outputs["accumulation_fine"]
+    return *find_surfaces(outputs, far), outputs["accumulation_fine"]
 
 
 def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torch.Tensor:
@@ -101,7 +105,7 @@ def render_rays(model: RayModel, rays: RayBundle, key: str = "rgb_fine") -> torc
 
 def render_view(model: RayModel, picture: Picture) -> np.ndarray:
     """A view's rendering (H, W, 3) in [0, 1]; FloatingPointError if a rendered value is not finite."""
-    height, width = picture.image.shape[:2]
+    height, width = picture.stored.shape[:2]
     rays = CameraRays.of(model, picture.camera)
     # all rays of a photo would take gigabytes
     parts = [render_rays(model, rays[pixels]) for pixels in model.chunks(height * width)]

@@ -44,8 +44,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     device = choose_device(config.machine.device_type, of_run=run is not None)
     ranks.join(device)
     views = read_train_views(config)
-    held_out = _read_first_split(config, ("val", "test"))
-    preview = None if held_out is None else _first_picture(held_out)
+    preview = _read_preview(config)
     check_value(
         "patience", config.patience, config.patience is None or preview is not None, "left out: no view is held out"
     )
@@ -184,9 +183,10 @@ def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views |
     return next((views for views in found if views is not None), None)
 
 
-def _first_picture(views: Views) -> Picture:
-    """The first view of which some pixels are known, without converting the others."""
-    return next(picture for i in range(len(views.names)) for picture in to_pictures(views.subset([i])))
+def _read_preview(config: TrainerConfig) -> Picture | None:
+    """The first held-out view of which some pixels are known; None: no view is held out."""
+    views = _read_first_split(config, ("val", "test"))
+    return None if views is None else to_pictures(views)[0]
 
 
 def read_train_views(config: TrainerConfig) -> Views:

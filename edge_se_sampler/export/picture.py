@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, write_image
 from edge_se_sampler.engine.frames import SEEN
 from edge_se_sampler.engine.metrics import composite_on
-from edge_se_sampler.engine.rendering import Picture, render_opaque, to_pictures
+from edge_se_sampler.engine.rendering import CameraRays, Picture, render_opaque, to_pictures
 from edge_se_sampler.engine.session import read_test_views
 from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.ray_model import RayModel
@@ -36,26 +37,34 @@ def read_compared(config: TrainerConfig, path: Path, view: int) -> Picture:
 def write_comparison(path: Path, model: RayModel, picture: Picture, mesh: Any, colors: np.ndarray) -> str:
     """Write a row of four images: a view, its rendering, and the mesh there, in its vertices' colors (v, 3) in [0, 1]
     and shaded in gray by a light at the camera. Returns a line with the mesh's distance from the rendered depth."""
-    image, camera, background = picture.image, picture.camera, model.config.background_level
-    size = image.shape[:2]
-    rays = picture.rays(model.device)
-    rendered, distance, opacity = (x.numpy() for x in render_opaque(model, rays))
-    depth = (distance / rays.metadata["directions_norm"].cpu().numpy()).reshape(size)
+    camera, background = picture.camera, model.config.background_level
+    rendered, depth = _render_with_depth(model, camera)
     face, shares, mesh_depth = rasterize(mesh.vertices, mesh.faces, camera)
-    hit, vertices = face >= 0, mesh.faces[face]
-    direction = rays.directions.cpu().numpy().reshape(*size, 3)
-    lit = np.abs(((shares[..., None] * mesh.vertex_normals[vertices]).sum(axis=2) * direction).sum(axis=2))
-    shown = (shares[..., None] * colors[vertices]).sum(axis=2), (AMBIENT + (1 - AMBIENT) * lit)[..., None]
-    columns = [
-        composite_on(image, background),
-        composite_on(np.concatenate((rendered, opacity), axis=1).reshape(*size, 4), background),
-        *(np.where(hit[..., None], values, background) for values in shown),
-    ]
-    write_image(path, np.concatenate([np.broadcast_to(column, (*size, 3)) for column in columns], axis=1))
-    both = hit & (opacity.reshape(size) > SEEN)
-    pixels = np.abs(mesh_depth - depth)[both] * float(camera.fx) / depth[both]
+    hit = face >= 0
+    corners, shares = mesh.faces[face[hit]], shares[hit, :, None]
+    directions = camera.image_rays(0).directions.numpy()[hit.reshape(-1)]
+    lit = np.abs(((shares * mesh.vertex_normals[corners]).sum(axis=1) * directions).sum(axis=1, keepdims=True))
+    row = [composite_on(image, background) for image in (picture.image, rendered)]
+    for values in ((shares * colors[corners]).sum(axis=1), AMBIENT + (1 - AMBIENT) * lit):
+        row.append(np.full_like(row[0], background))
+        row[-1][hit] = values
+    write_image(path, np.concatenate(row, axis=1))
+    both = hit & (rendered[..., 3] > SEEN)
+    pixels = np.abs(mesh_depth[both] - depth[both]) * float(camera.fx) / depth[both]
     median, most = np.quantile(pixels, (0.5, 0.9)) if both.any() else (np.nan, np.nan)
     return f"{path}: the mesh is {median:.2f} pixels from the rendered depth (median; 90 %: {most:.2f})"
+
+
+def _render_with_depth(model: RayModel, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """What a camera sees: (H, W, 4), straight alpha, and depths along the optical axis (H, W), world units."""
+    rays, parts = CameraRays.of(model, camera), []
+    size = int(camera.height), int(camera.width)
+    for some in model.chunks(math.prod(size)):
+        chunk = rays[some]
+        colors, distance, opacity = render_opaque(model, chunk)
+        parts.append(torch.cat((colors, opacity, distance / chunk.metadata["directions_norm"].cpu()), dim=1))
+    rendered = torch.cat(parts).numpy().reshape(*size, 5)
+    return rendered[..., :4], rendered[..., 4]
 
 
 def rasterize(vertices: np.ndarray, triangles: np.ndarray, camera: Cameras) -> tuple[np.ndarray, ...]:

@@ -175,11 +175,11 @@ class LeanModel(RayModel):
         of_rays = rendered.rgb, rendered.accumulation, rendered.distance
         # the sum of columns, for torch's means over few numbers are slow
         rgb, accumulation, distance = (sum(x.reshape(-1, size, x.shape[1]).unbind(dim=1)) / size for x in of_rays)
-        background, passing = self.get_background(rays), 1 - accumulation
-        outputs = {"rgb_fine": rgb + passing * background, "accumulation_fine": accumulation}
+        background, transmittance = self.get_background(rays), 1 - accumulation
+        outputs = {"rgb_fine": rgb + transmittance * background, "accumulation_fine": accumulation}
         if not self.training:
             depth = distance * float(self.grid.cell_size)
-            outputs["depth_fine"] = depth + passing * self.config.depths[1] * rays.metadata["directions_norm"]
+            outputs["depth_fine"] = depth + transmittance * self.config.depths[1] * rays.metadata["directions_norm"]
         return outputs | {"background": background}, rendered
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:

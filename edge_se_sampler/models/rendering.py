@@ -35,6 +35,12 @@ def composite(weights: Tensor, colors: Tensor, background: Tensor) -> Tensor:
     return rendered + (1 - weights.sum(dim=1, keepdim=True)) * background
 
 
+def remove_background(values: Tensor, opacity: Tensor, background: Tensor) -> Tensor:
+    """What rays' colors or distances (n, c) would be without that of the background (n, c) behind: means over what is
+    seen, of no meaning where the opacity (n, 1) is next to nothing."""
+    return (values - (1 - opacity) * background) / opacity.clamp(min=1e-3)
+
+
 def stratified(near: Tensor, far: Tensor, count: int, jitter: Tensor | None) -> Tensor:
     """`count` distances between near and far: one uniform draw in each of as many bins (NeRF, equation 2).
 

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from edge_se_sampler.devices import has_float64
-from edge_se_sampler.occupancy.bricks import BRICK, OFFSETS, BrickGrid, pack_bits, unpack_bits
+from edge_se_sampler.occupancy.bricks import BRICK, OFFSETS, BrickGrid, pack_bits
 
 NUM_HARMONICS = 16
 """Spherical harmonics up to degree 3."""
@@ -84,7 +84,7 @@ class Rendered:
     accumulation: Tensor
     """(n, 1) opacity."""
     distance: Tensor
-    """(n, 1): weights times distances of samples, in sides of a cell; without a gradient."""
+    """(n, 1): weights times distances of all samples, in sides of a cell; without a gradient."""
     cells: Tensor
     """(c,) int64: rows of the cells of samples that have a color; kernels leave it empty where nothing is trained."""
     weights: Tensor
@@ -110,8 +110,8 @@ def render(
     color = shade(values, spans.directions, samples.ray_indices[colored], network)
     rgb, accumulation, weights = composite(tau, color, samples, num_rays)
     distance = torch.zeros_like(accumulation)
-    distance.index_add_(0, samples.ray_indices[colored], (samples.t[colored] * weights)[:, None])
-    return Rendered(rgb, accumulation, distance, samples.rows[colored, 0].long(), weights)
+    distance.index_add_(0, samples.ray_indices, (samples.t * weights)[:, None])
+    return Rendered(rgb, accumulation, distance, samples.rows[colored, 0].long(), weights[colored])
 
 
 def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | None, marching: Marching) -> Samples:
@@ -127,19 +127,19 @@ def march(grid: BrickGrid, density: Tensor, spans: RaySpans, jitter: Tensor | No
     ray, index, position, cell = ray[inside], index[inside], position[inside], cell[inside]
     brick = grid.table[tuple((cell // BRICK).T)].long()
     in_brick = (cell % BRICK * torch.tensor([BRICK * BRICK, BRICK, 1], device=cell.device)).sum(dim=1)
-    sampled = (brick >= 0) & unpack_bits(grid.sampled)[brick.clamp(min=0), in_brick]
+    sampled = (brick >= 0) & ((grid.sampled[brick.clamp(min=0)] >> in_brick) & 1 > 0)
     ray, index, brick, in_brick = ray[sampled], index[sampled], brick[sampled], in_brick[sampled]
     rows = grid.corner_rows(brick, in_brick)
     weights = corner_weights(position[sampled] - cell[sampled])
     raw = interpolate(density.detach(), rows, weights)[:, 0]
     alpha = 1 - torch.exp(-torch.exp(raw) * marching.density_scale)
     opaque = raw > marching.density_min
-    passing = torch.ones_like(t)
-    passing[ray, index] = torch.where(opaque, 1 - alpha, 1.0)
-    passing = torch.cat((torch.ones_like(begin), passing.cumprod(dim=1)), dim=1)[ray, index]
-    kept = opaque & (passing >= marching.transmittance_min)
-    colored = torch.nonzero((passing * alpha > marching.weight_min)[kept])[:, 0]
-    visible = (passing >= marching.visible_min)[kept]
+    transmittance = torch.ones_like(t)
+    transmittance[ray, index] = torch.where(opaque, 1 - alpha, 1.0)
+    transmittance = torch.cat((torch.ones_like(begin), transmittance.cumprod(dim=1)), dim=1)[ray, index]
+    kept = opaque & (transmittance >= marching.transmittance_min)
+    colored = torch.nonzero((transmittance * alpha > marching.weight_min)[kept])[:, 0]
+    visible = (transmittance >= marching.visible_min)[kept]
     return Samples(t[ray, index][kept], ray[kept], rows[kept].int(), weights[kept], colored, visible)
 
 
@@ -211,11 +211,12 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 def composite(tau: Tensor, color: Tensor, samples: Samples, num_rays: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Colors (n, 3), accumulated opacity (n, 1) and weights (c,) of colored samples, by tau (m,) and color (c, 3)
-    (NeRF, equation 3)."""
+    """Colors (n, 3), accumulated opacity (n, 1) and weights (m,), without a gradient, by tau (m,) and the color (c, 3)
+    of colored samples (NeRF, equation 3)."""
     before, total = sum_along_rays(tau, samples.ray_indices, num_rays)
-    weight = (torch.exp(-before) * -torch.expm1(-tau.to(before.dtype))).to(tau.dtype)[samples.colored]
-    rgb = tau.new_zeros((num_rays, 3)).index_add(0, samples.ray_indices[samples.colored], weight[:, None] * color)
+    weight = (torch.exp(-before) * -torch.expm1(-tau.to(before.dtype))).to(tau.dtype)
+    of_colored = weight[samples.colored, None]
+    rgb = tau.new_zeros((num_rays, 3)).index_add(0, samples.ray_indices[samples.colored], of_colored * color)
     return rgb, -torch.expm1(-total)[:, None].to(tau.dtype), weight.detach()
 
 

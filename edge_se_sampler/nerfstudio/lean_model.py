@@ -26,6 +26,7 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.config import LeanModelConfig, decide_size
 from edge_se_sampler.models.lean import LeanModel
+from edge_se_sampler.models.rendering import remove_background
 from edge_se_sampler.nerfstudio.resume import run_progress
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.image_batch import unit_interval
@@ -85,7 +86,7 @@ class LeanNerfModel(Model):
         if self.training:
             return {"rgb": rgb, "accumulation": opacity, "rendered": rendered}
         far = self.field.config.depths[1] * rays.metadata["directions_norm"]
-        depth = (outputs["depth_fine"] - (1 - opacity) * far) / opacity
+        depth = remove_background(outputs["depth_fine"], opacity, far)
         return {"rgb": rgb, "accumulation": opacity, "depth": torch.where(opacity > 0.5, depth, far)}
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:
@@ -123,8 +124,8 @@ class LeanNerfModel(Model):
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Straight alpha: nothing of the background. So exports leave it out."""
         opacity = outputs["accumulation"]
-        rgb = outputs[output_name] - (1 - opacity) * self._background(outputs[output_name])
-        return torch.cat(((rgb / opacity.clamp(min=1e-10)).clamp(0, 1), opacity), dim=-1)
+        rgb = remove_background(outputs[output_name], opacity, self._background(outputs[output_name]))
+        return torch.cat((rgb.clamp(0, 1), opacity), dim=-1)
 
     def get_param_groups(self) -> dict[str, Any]:
         """Torch's groups of one optimizer; their learning rates are multiples of its own."""

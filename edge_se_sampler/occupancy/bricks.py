@@ -204,12 +204,13 @@ class BrickGrid(nn.Module):
         self.register_buffer("sampled_bricks", self.bricks[some], persistent=False)
         table = torch.zeros(self.shape, dtype=torch.bool, device=some.device)
         table[tuple(self.sampled_bricks.T)] = True
-        distance = torch.zeros(self.shape, dtype=torch.int32, device=some.device)
+        distance = torch.zeros(self.shape, dtype=torch.uint8, device=some.device)
         for _ in range(MAX_DISTANCE):
             distance += ~table
             table = dilate(table)
-        distance.neg_()[tuple(self.sampled_bricks.T)] = torch.nonzero(some)[:, 0].int()
-        self.register_buffer("table", distance, persistent=False)
+        table = distance.int().neg_()
+        table[tuple(self.sampled_bricks.T)] = torch.nonzero(some)[:, 0].int()
+        self.register_buffer("table", table, persistent=False)
 
     def update_max_weight(self, rows: Tensor, weights: Tensor) -> None:
         """Remember the weights (m,) of samples, by the rows (m,) int64 of their cells; and those of all ranks."""
@@ -299,7 +300,8 @@ def unpack_bits(numbers: Tensor) -> Tensor:
 def dilate(cells: Tensor) -> Tensor:
     """(X, Y, Z) bool: cells and the 26 around each."""
     for axis in range(3):
-        padding = [0, 0] * (2 - axis) + [1, 1] + [0, 0] * axis
-        size, padded = cells.shape[axis], F.pad(cells, padding)
-        cells = padded.narrow(axis, 0, size) | cells | padded.narrow(axis, 2, size)
+        rest, dilated = cells.shape[axis] - 1, cells.clone()
+        dilated.narrow(axis, 1, rest).logical_or_(cells.narrow(axis, 0, rest))
+        dilated.narrow(axis, 0, rest).logical_or_(cells.narrow(axis, 1, rest))
+        cells = dilated
     return cells

@@ -87,7 +87,7 @@ def _depths_of_features(views: Views) -> DepthRange | None:
     found = _depths_of_points(views_with_points, "features that several images show", FEATURE_MARGIN)
     if found is None or not found.near_share:
         return found
-    (closest,) = _rounded(found.near_share * _distances(views.cameras, find_focus(views.cameras)[0]).min())
+    (closest,) = _rounded(found.near_share * views.cameras.find_distances(find_focus(views.cameras)[0]).min())
     return replace(found, near=min(found.near, closest))
 
 
@@ -103,7 +103,7 @@ def _reach(views: Views) -> tuple[float, float, float] | None:
     focus, focus_depth = find_focus(views.cameras)
     if not (focus_depth > 0).all():
         return low, high, 0.0
-    shares = depths / np.repeat(_distances(views.cameras, focus), [len(points) for points in seen])
+    shares = depths / np.repeat(views.cameras.find_distances(focus), [len(points) for points in seen])
     return low, high, min(float(np.percentile(shares[ahead], POINT_PERCENTILES[0])), 0.99)
 
 
@@ -149,11 +149,6 @@ def _depths_of_cameras(views: Views) -> DepthRange | None:
         return None
     near, far = _rounded(*(factor * distance for factor in CAMERA_FACTORS))
     return DepthRange(near, far, "the cameras: 0.3 to 2 times as far as what they look at", NEAR_SHARE)
-
-
-def _distances(cameras: Cameras, focus: np.ndarray) -> np.ndarray:
-    """(n,) distance of each camera from the focus."""
-    return np.linalg.norm(cameras.camera_to_worlds[:, :, 3].numpy() - focus, axis=1)
 
 
 def _depth(cameras: Cameras, camera: int, points: np.ndarray) -> np.ndarray:

@@ -93,8 +93,7 @@ def analyze_scene(
         raise _nothing_seen(box)
     num_pixels = sum(_count_shown(views, i, bool(silhouettes)) for i in range(len(views.images)))
     point, _ = find_focus(views.cameras)
-    distances = np.linalg.norm(views.cameras.camera_to_worlds[:, :, 3].numpy() - point, axis=1)
-    focus = np.array([*point, near_share, distances.max()])
+    focus = np.array([*point, near_share, views.cameras.find_distances(point).max()])
     return SceneAnalysis(
         box, len(silhouettes), show_whole_object(silhouettes), hull, max_level, hit_pixels, num_pixels, focus
     )

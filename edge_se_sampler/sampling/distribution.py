@@ -24,6 +24,8 @@ import torch
 from torch import Tensor
 
 B = 32
+AHEAD = 16
+"""Images whose strengths are held before they are added: they take more room than what is kept of them."""
 CDF_SCALE = 2**30
 """The integer that stands for a node's whole mass: two draws within a node fit into one 64-bit random number."""
 
@@ -177,11 +179,11 @@ class PixelTable:
         return torch.from_numpy(p * (self._mass[node] - below))
 
 
-def in_threads(strength: Callable[[int], Tensor], images: Sequence[int], ahead: int = 16) -> Iterator[Tensor]:
-    """Strengths of images for `PixelTable.add`, computed in threads, but never more than `ahead` in advance."""
+def in_threads(strength: Callable[[int], Tensor], images: Sequence[int]) -> Iterator[Tensor]:
+    """Strengths of images for `PixelTable.add`, computed in threads, but never more than `AHEAD` in advance."""
     with ThreadPoolExecutor() as threads:
-        for start in range(0, len(images), ahead):
-            yield from threads.map(strength, images[start : start + ahead])
+        for start in range(0, len(images), AHEAD):
+            yield from threads.map(strength, images[start : start + AHEAD])
 
 
 def _flat(strength: Tensor) -> Tensor:

@@ -13,7 +13,9 @@ from torch import Tensor
 
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.files import to_uint8
+from edge_se_sampler.engine.frames import SEEN
 from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.models.rendering import remove_background
 from edge_se_sampler.sampling.edges import unit_float
 from edge_se_sampler.viewer.viewed import Viewed
 
@@ -86,10 +88,12 @@ class Renderer:
             return None
         if output == "rgb":
             return to_uint8(found["rgb_fine"].numpy())
-        accumulation = found["accumulation_fine"][..., 0].numpy()
+        opacity = found["accumulation_fine"]
         if output == "accumulation":
-            return colored(accumulation)
-        depth, seen = found["depth_fine"][..., 0].numpy(), accumulation > 0.5
+            return colored(opacity[..., 0].numpy())
+        norm = camera.to("cpu", torch.float32).image_rays(0).metadata["directions_norm"].reshape(opacity.shape)
+        depth = remove_background(found["depth_fine"], opacity, self.viewed.model.config.depths[1] * norm)
+        depth, seen = depth[..., 0].numpy(), opacity[..., 0].numpy() > SEEN
         low, high = (depth[seen].min(), depth[seen].max()) if seen.any() else (0.0, 1.0)
         return colored(np.where(seen, (high - depth) / max(high - low, 1e-9), 0.0))
 

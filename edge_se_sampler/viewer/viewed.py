@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -39,16 +40,23 @@ class Turns:
     """A lock that goes to who has waited longest: training, which asks again at once, must not keep it to itself."""
 
     def __init__(self) -> None:
-        self._changed, self._next, self._current = Condition(), 0, 0
+        self._changed = Condition()
+        self._waiting: deque[object] = deque()  # the first has its turn
 
     def __enter__(self) -> None:
         with self._changed:
-            turn, self._next = self._next, self._next + 1
-            self._changed.wait_for(lambda: turn == self._current)
+            me = object()
+            self._waiting.append(me)
+            try:
+                self._changed.wait_for(lambda: self._waiting[0] is me)
+            except BaseException:  # Ctrl-C: others must not wait for who has gone
+                self._waiting.remove(me)
+                self._changed.notify_all()
+                raise
 
     def __exit__(self, *_: object) -> None:
         with self._changed:
-            self._current += 1
+            self._waiting.popleft()
             self._changed.notify_all()
 
 

@@ -26,7 +26,7 @@ class Buffers(NamedTuple):
     weights: np.ndarray  # (S, 8 M): of the corners
     t: np.ndarray  # (S, M)
     tau: np.ndarray  # (S, M); in the backward pass it becomes the gradient of the raw density
-    passing: np.ndarray  # (S, M): light that reaches a sample
+    transmittance: np.ndarray  # (S, M): before each sample
     color_index: np.ndarray  # (S, M) int32: row of what follows; -1: without a color
     features: np.ndarray  # (S, FEATURES M); in the backward pass they become their gradient
     hidden: np.ndarray  # (S, WIDTH M); in the backward pass it becomes its gradient
@@ -52,7 +52,7 @@ class Buffers(NamedTuple):
             weights=empty(8 * samples),
             t=empty(samples),
             tau=empty(samples),
-            passing=empty(samples),
+            transmittance=empty(samples),
             color_index=empty(samples, dtype=np.int32),
             features=empty(FEATURES * samples),
             hidden=empty(WIDTH * samples),

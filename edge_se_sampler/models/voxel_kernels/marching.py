@@ -67,14 +67,14 @@ def march_chunk(rays, first, last, cells, buffers, slot):
     """Enter the samples of rays first .. last - 1 into a slot; returns how many there are, even if there is no room
     for all."""
     rows, weights, t, tau = buffers.rows[slot], buffers.weights[slot], buffers.t[slot], buffers.tau[slot]
-    light, color_index, sample_ends = buffers.passing[slot], buffers.color_index[slot], buffers.ends[slot]
+    before, color_index, sample_ends = buffers.transmittance[slot], buffers.color_index[slot], buffers.ends[slot]
     next_sample, inverse = buffers.next_sample[slot], buffers.inverse[slot]
     room = len(t) - 1
     m, c = 0, 0
     _find_first_samples(rays, first, last, cells, next_sample, inverse)
     for i in range(first, last):
         ray = i - first
-        passing, j = f32(1), next_sample[ray]
+        transmittance, j = f32(1), next_sample[ray]
         while j >= 0:
             s, x, y, z, brick, cell, following = _find_cell(rays, i, cells, inverse, 3 * ray, j)
             j = following
@@ -88,14 +88,14 @@ def march_chunk(rays, first, last, cells, buffers, slot):
                 rows[8 * k + corner] = row
                 raw += weights[8 * k + corner] * cells.density[row]
             if raw > cells.density_min:
-                t[k], tau[k], light[k], color_index[k] = s, math.exp(raw) * cells.density_scale, passing, -1
+                t[k], tau[k], before[k], color_index[k] = s, math.exp(raw) * cells.density_scale, transmittance, -1
                 transparency = math.exp(-tau[k])
-                if passing * (f32(1) - transparency) > cells.weight_min:
+                if transmittance * (f32(1) - transparency) > cells.weight_min:
                     color_index[k] = min(c, room)
                     c += 1
                 m += 1
-                passing *= transparency
-                if passing < cells.transmittance_min:
+                transmittance *= transparency
+                if transmittance < cells.transmittance_min:
                     break
         sample_ends[ray] = m
     sample_ends[last - first :] = m

@@ -146,21 +146,21 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
 def _composite_chunk(first, last, buffers, slot, rgb, accumulation, distance):
     start = 0
     for i in range(first, last):
-        red, green, blue, far, passing = f32(0), f32(0), f32(0), f32(0), f32(1)
+        red, green, blue, far, transmittance = f32(0), f32(0), f32(0), f32(0), f32(1)
         for k in range(start, buffers.ends[slot, i - first]):
             index = buffers.color_index[slot, k]
-            passing = buffers.passing[slot, k] * math.exp(-buffers.tau[slot, k])
+            transmittance = buffers.transmittance[slot, k] * math.exp(-buffers.tau[slot, k])
+            weight = buffers.transmittance[slot, k] - transmittance
+            far += weight * buffers.t[slot, k]
             if index >= 0:
-                weight = buffers.passing[slot, k] - passing
                 red += weight * buffers.color[slot, 3 * index]
                 green += weight * buffers.color[slot, 3 * index + 1]
                 blue += weight * buffers.color[slot, 3 * index + 2]
-                far += weight * buffers.t[slot, k]
                 buffers.color_weight[slot, index] = weight
                 buffers.color_cell[slot, index] = buffers.rows[slot, 8 * k]
         start = buffers.ends[slot, i - first]
         rgb[i, 0], rgb[i, 1], rgb[i, 2] = red, green, blue
-        accumulation[i, 0], distance[i, 0] = f32(1) - passing, far
+        accumulation[i, 0], distance[i, 0] = f32(1) - transmittance, far
 
 
 @njit(cache=True)
@@ -194,16 +194,16 @@ def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, visible
         # what the light that passes a sample adds to the loss
         behind = -(f32(1) - accumulation[i, 0]) * d_accumulation[i, 0]
         for k in range(end - 1, start - 1, -1):
-            tau, passing, index = buffers.tau[slot, k], buffers.passing[slot, k], buffers.color_index[slot, k]
-            after = passing * math.exp(-tau)
+            tau, before, index = buffers.tau[slot, k], buffers.transmittance[slot, k], buffers.color_index[slot, k]
+            after = before * math.exp(-tau)
             d_sample = f32(0)
             if index >= 0:
                 for channel in range(3):
                     color, d = buffers.color[slot, 3 * index + channel], d_rgb[i, channel]
                     d_sample += d * color
-                    buffers.color[slot, 3 * index + channel] = (passing - after) * d * color * (f32(1) - color)
-            buffers.tau[slot, k] = (after * d_sample - behind) * tau if passing >= visible_min else f32(0)
-            behind += (passing - after) * d_sample
+                    buffers.color[slot, 3 * index + channel] = (before - after) * d * color * (f32(1) - color)
+            buffers.tau[slot, k] = (after * d_sample - behind) * tau if before >= visible_min else f32(0)
+            behind += (before - after) * d_sample
         start = end
 
 
