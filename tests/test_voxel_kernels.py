@@ -18,6 +18,7 @@ from tiny import ball_views, tiny_trainer
 from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import voxel_backend, voxel_kernels, voxel_ops
+from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.lean import ColorNetwork
 from edge_se_sampler.models.voxel_kernels import rendering
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
@@ -290,6 +291,12 @@ assert (torch.get_num_threads(), numba.get_num_threads()) == (2, min(2, numba.co
 
 
 @pytest.mark.slow
+def test_compiling_leaves_torch_s_global_generator_alone() -> None:
+    before = torch.get_rng_state()
+    compile_ops("cpu")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_kernels_use_as_many_threads_as_torch() -> None:
     subprocess.run([sys.executable, "-c", THREADS], check=True, cwd=Path(__file__).parent)
 
