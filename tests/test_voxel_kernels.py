@@ -275,6 +275,12 @@ def test_nothing_is_left_to_compile_when_the_clock_runs() -> None:
     subprocess.run([sys.executable, "-c", COMPILED], check=True, cwd=Path(__file__).parent)
 
 
+def test_compiling_leaves_torch_s_global_generator_alone() -> None:
+    before = torch.get_rng_state()
+    compile_ops("cpu")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 THREADS = """
 import torch
 torch.set_num_threads(1)
@@ -291,12 +297,6 @@ assert (torch.get_num_threads(), numba.get_num_threads()) == (2, min(2, numba.co
 
 
 @pytest.mark.slow
-def test_compiling_leaves_torch_s_global_generator_alone() -> None:
-    before = torch.get_rng_state()
-    compile_ops("cpu")
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_kernels_use_as_many_threads_as_torch() -> None:
     subprocess.run([sys.executable, "-c", THREADS], check=True, cwd=Path(__file__).parent)
 
