@@ -239,8 +239,23 @@ def test_a_held_out_split_that_nobody_rendered_is_left_out(
     (tmp_path / "test").mkdir()
     iio.imwrite(tmp_path / "test/0001.png", pixels(1))
     if frames == "of images":  # then the others are missing
-        with pytest.raises(InputError, match=r"frames\[0\].file_path: 'test/0000.png' does not exist"):
+        with pytest.raises(InputError, match="frames: 2 of the 3 listed images do not exist"):
             read_split(tmp_path, "test")
+        iio.imwrite(tmp_path / "test/0002.png", pixels(2))
+        views = read_split(tmp_path, "test")
+        assert views is not None
+        assert views.names == ("test/0001.png", "test/0002.png")
+        assert "1 of the 3 listed images do not exist, 'test/0000.png' for one: left out" in capsys.readouterr().err
+
+
+def test_held_out_images_that_are_trained_on_are_said(
+    tmp_path: Path, doc: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_json(tmp_path, doc | {"frames": doc["frames"][:1]}, "test")
+    assert read_split(tmp_path, "test") is not None
+    assert "1 of 1 images are in transforms_train.json, too, './train/r_0.png' for one" in capsys.readouterr().err
+    read_split(tmp_path, "train")
+    assert not capsys.readouterr().err
 
 
 def test_a_training_split_without_images_is_an_error(tmp_path: Path, doc: dict[str, Any]) -> None:

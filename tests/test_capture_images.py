@@ -34,7 +34,7 @@ from capture_folder import (
 from edge_se_sampler.data import memory
 from edge_se_sampler.data.image_file import ImageHeader, read_header
 from edge_se_sampler.data.lens import find_sources
-from edge_se_sampler.data.mask_files import place_of_mask
+from edge_se_sampler.data.mask_files import find_mask, place_of_mask
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.errors import InputError
@@ -91,6 +91,92 @@ def test_masks_of_images_that_are_links_are_where_they_were_written(kind: str, t
         mask.parent.mkdir(parents=True, exist_ok=True)
         iio.imwrite(mask, half_mask())
     np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], half_mask())
+
+
+def with_alpha(gray: int) -> np.ndarray:
+    return np.dstack((np.full((HEIGHT, WIDTH, 3), gray, np.uint8), half_mask()))
+
+
+@pytest.mark.parametrize("mask", [half_mask() // 255, half_mask() // 2, with_alpha(255), with_alpha(0)])
+def test_masks_as_programs_write_them(mask: np.ndarray, tmp_path: Path) -> None:
+    """0 and 1, or another number, are no alpha; and some have it in their alpha alone."""
+    write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in NAMES:
+        iio.imwrite(tmp_path / "masks" / name, mask)
+    masks = read(tmp_path).masks
+    assert masks is not None
+    np.testing.assert_array_equal(masks[0], half_mask() > 0)
+    np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], half_mask())
+
+
+def test_soft_masks_stay_soft(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    soft = np.broadcast_to(np.arange(WIDTH, dtype=np.uint8), (HEIGHT, WIDTH))
+    for name in NAMES:
+        iio.imwrite(tmp_path / "masks" / name, soft)
+    np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], soft)
+
+
+@pytest.mark.parametrize(
+    ("listed", "mask"),
+    [
+        ("images/a.jpg", "masks/a.jpg.png"),
+        ("images/a.jpg", "masks/a.png"),
+        ("images/a.jpg", "masks/a.jpg"),
+        ("./images/b/a.jpg", "masks/b/a.png"),
+        ("images_4/a.jpg", "masks_4/a.png"),
+        ("images_4/a.jpg", "masks/a.png"),
+        ("train/a.png", "masks/train/a.png"),
+        ("a.jpg", "masks/a.png"),
+    ],
+)
+def test_where_masks_are_found(listed: str, mask: str, tmp_path: Path) -> None:
+    """By the listed name, and by that of the file that it is a link to."""
+    for path in (listed, mask):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).touch()
+    os.symlink(tmp_path / listed, tmp_path / "link.jpg")
+    for name in (listed, "link.jpg"):
+        found = find_mask(tmp_path, name, SourceFile((tmp_path / listed).resolve(), SourceLocation(tmp_path)))
+        assert found is not None
+        assert found.path == (tmp_path / mask).resolve()
+    nothing = find_mask(tmp_path, "other.jpg", SourceFile(tmp_path.resolve() / "other.jpg", SourceLocation(tmp_path)))
+    assert nothing is None
+
+
+def test_a_link_has_the_mask_of_its_own_name_first(tmp_path: Path) -> None:
+    for name in ("masks/a.png", "masks/all/a.png", "all/a.jpg"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    image = SourceFile((tmp_path / "all/a.jpg").resolve(), SourceLocation(tmp_path))
+    for listed, mask in (("images/a.jpg", "masks/a.png"), ("all/a.jpg", "masks/all/a.png")):
+        found = find_mask(tmp_path, listed, image)
+        assert found is not None
+        assert found.path == (tmp_path / mask).resolve()
+
+
+def test_views_without_a_mask_are_said_to_be_object_as_a_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in NAMES[:6]:
+        iio.imwrite(tmp_path / "masks" / name, half_mask())
+    read(tmp_path, masks="object")
+    assert "2 of 7 views have neither mask nor alpha, 'images/view 06.png' for one" in capsys.readouterr().err
+    read(tmp_path)
+    assert not capsys.readouterr().err
+
+
+def test_masks_that_leave_no_object_are_an_error(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in NAMES:
+        iio.imwrite(tmp_path / "masks" / name, 0 * half_mask())
+    with pytest.raises(InputError, match=r"'images/view 01.png' and all other views are masked as a whole"):
+        read(tmp_path, masks="object")
 
 
 def test_masks_as_objects_where_there_are_none(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from capture_folder import (
     SQUARE_PIXELS,
     WIDTH,
     Distortion,
+    bounds,
     colmap_files,
     picture,
     points,
@@ -38,13 +39,15 @@ from capture_folder import (
     write_blender,
     write_colmap,
     write_images,
+    write_llff,
     write_transforms,
 )
 from tiny import SMALL
 
 from edge_se_sampler.data.capture import Capture
-from edge_se_sampler.data.colmap import read_colmap
+from edge_se_sampler.data.colmap import is_scaled, read_colmap
 from edge_se_sampler.data.dataset import find_format, read_split
+from edge_se_sampler.data.image_file import ImageHeader
 from edge_se_sampler.data.lens import find_sources
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.errors import InputError
@@ -136,6 +139,56 @@ def test_formats_are_told_by_what_the_folder_has(tmp_path: Path) -> None:
         find_format(tmp_path, "blender")
     write_blender(tmp_path)
     assert find_format(tmp_path) == "blender"
+
+
+def test_a_folder_around_a_scene_names_it(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "around" / "scene")
+    with pytest.raises(InputError, match="its folder 'scene' has such"):
+        find_format(tmp_path / "around")
+
+
+def test_an_only_image_is_held_out_and_that_is_said(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": document["frames"][:1]}))
+    with pytest.raises(InputError, match="its only image is held out"):
+        read(tmp_path)
+
+
+def test_a_list_of_test_frames_is_left_out_and_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = write_transforms(tmp_path)
+    changed = {"frames": document["frames"][2:], "test_frames": document["frames"][:2]}
+    (tmp_path / "transforms.json").write_text(json.dumps(document | changed))
+    read(tmp_path)
+    assert "test_frames: 2 held-out images are left out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("size", "camera", "fits"),
+    [
+        ((135, 241), (1087, 1928), True),  # an eighth, its width cut, its height rounded
+        ((241, 135), (1928, 1087), True),
+        ((135, 240), (1080, 1920), True),
+        ((135, 245), (1087, 1928), False),
+        ((240, 135), (1080, 1920), False),
+    ],
+)
+def test_a_scaled_image_has_its_cameras_shape_but_for_rounding(
+    size: tuple[int, int], camera: tuple[int, int], fits: bool
+) -> None:
+    assert is_scaled(ImageHeader(*size, 3), *camera) == fits
+
+
+@pytest.mark.parametrize("kind", ["colmap", "llff"])
+def test_what_macos_puts_beside_images_is_no_image(kind: str, tmp_path: Path) -> None:
+    if kind == "colmap":
+        write_colmap(tmp_path)
+    else:
+        write_llff(tmp_path, bounds())
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / ".DS_Store").touch()
+    (tmp_path / "images_2" / "._view 00.png").touch()
+    assert len(read(tmp_path).names) == 7
 
 
 def test_every_eighth_image_is_held_out_or_every_nth(tmp_path: Path) -> None:

@@ -266,7 +266,7 @@ def test_a_mask_of_another_size(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     (tmp_path / "masks").mkdir()
     iio.imwrite(tmp_path / "masks" / NAMES[1], np.ones((3, 3), np.uint8))
-    assert re.search(r"images\[1\]: 'view 01.png' is 3 x 3 pixels, its image 48 x 36", refusal(tmp_path))
+    assert re.search(r"images\[1\]: 'masks/view 01.png' is 3 x 3 pixels, its image 48 x 36", refusal(tmp_path))
 
 
 @pytest.mark.parametrize("kind", ["image", "mask"])

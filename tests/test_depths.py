@@ -91,7 +91,7 @@ def test_cameras_alone() -> None:
 def test_a_single_camera_tells_nothing() -> None:
     view = opaque(moved(ball_views(12, 32), 10.0, (0.0, 0.0, 0.0))).subset([0])
     config = method_configs()["lean-nerf"]
-    with pytest.raises(InputError, match="give both near and far"):
+    with pytest.raises(InputError, match=r"give --pipeline\.model\.near"):
         resolve_config(config, view)
     given = override(config, {"pipeline.model.near": 10.0, "pipeline.model.far": 60.0})
     model = lean_model(resolve_config(given, view))
@@ -111,7 +111,7 @@ def test_nothing_is_told_by_where_the_origin_is(
         ball, images=ball.images[:1] * 6, cameras=replace(ball.cameras, camera_to_worlds=poses.contiguous())
     )
     for views in (ball.subset([0]), parallel):
-        with pytest.raises(InputError, match="give both near and far"):
+        with pytest.raises(InputError, match=r"give --pipeline\.model\.near"):
             find_depths(show(moved(views, 1.0, shift)))
 
 
@@ -167,7 +167,10 @@ def test_scenes_of_another_size_have_depths_of_their_own(scale: float, is_nerfs:
     for frame in frames:
         for row in frame["transform_matrix"][:3]:
             row[3] *= scale
-    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    written, camera = tmp_path / "transforms_train.json", {"camera_angle_x": 1.0}
+    written.write_text(json.dumps(camera | {"k1": 0.0, "aabb_scale": 4, "frames": frames}))  # as colmap2nerf.py does
+    assert read_blender(tmp_path, "train").depths is None
+    written.write_text(json.dumps(camera | {"frames": frames}))
     views = read_blender(tmp_path, "train")
     assert (views.depths == (2.0, 6.0)) == is_nerfs
     found = find_depths(views)

@@ -24,14 +24,12 @@ from edge_se_sampler.data.scene_file import SourceFile, SourceLocation, check_li
 FOLDERS = ("images", "images_2", "images_4", "images_8")
 """Where the images may be: the largest ones that there are."""
 ROUNDING = 1.5
-"""Pixels by which a scaled image's height may be off what its width says."""
+"""Pixels by which a side of a scaled image may be off what the other says."""
 
 
 def read_colmap(folder: Path) -> Capture:
-    """The registered images of a scene that exist, in the order of their names, with the points that each sees. A mask
-    has its image's path in the folder `masks` (masks_2 for images_2, ...), with .png added or in place of the suffix,
-    or that of the file that it is a link to; an image without one is not masked. InputError for files that cannot be
-    used, or if fewer than half of the images exist."""
+    """The registered images of a scene that exist, in the order of their names, with the points that each sees.
+    InputError for files that cannot be used, or if fewer than half of the images exist."""
     model, *others = find_models(folder)
     cameras, listed = read_cameras(model), read_images(model)
     images_folder = find_images(folder)
@@ -45,8 +43,7 @@ def read_colmap(folder: Path) -> Capture:
         list(zip(listed, files, strict=True)), files, SourceLocation(files[0].location.file)
     )
     headers = read_headers([file for _, file in pairs])
-    masks_folder = folder / images_folder.name.replace("images", "masks")
-    masks = [_find_mask(image, masks_folder) or find_mask(folder, file) for image, file in pairs]
+    masks = [find_mask(folder, f"{images_folder.name}/{image.name}", file) for image, file in pairs]
     frames = [
         _frame(image, cameras[image.camera_id], file, header, mask)
         for (image, file), header, mask in zip(pairs, headers, masks, strict=True)
@@ -59,10 +56,21 @@ def read_colmap(folder: Path) -> Capture:
 def find_images(folder: Path) -> Path:
     """The first of FOLDERS that has something; InputError if there is none."""
     for name in FOLDERS:
-        if os.path.isdir(folder / name) and os.listdir(folder / name):
+        if os.path.isdir(folder / name) and list_visible(folder / name):
             locate_file(folder, name, SourceLocation(folder))
             return folder / name
     raise SourceLocation(folder).error("has no images", f"put them into {', '.join(FOLDERS[:-1])} or {FOLDERS[-1]}")
+
+
+def list_visible(folder: Path) -> list[str]:
+    """Names in a folder without those that begin with a dot, which macOS puts beside images."""
+    return [name for name in os.listdir(folder) if not name.startswith(".")]
+
+
+def is_scaled(header: ImageHeader, width: float, height: float) -> bool:
+    """Whether an image can be one of that size, scaled: one of its sides says the other, but for `ROUNDING`."""
+    misfits = header.height - header.width * height / width, header.width - header.height * width / height
+    return min(map(abs, misfits)) <= ROUNDING
 
 
 def _locate(images_folder: Path, image: ColmapImage) -> SourceFile:
@@ -75,7 +83,7 @@ def _frame(
     image: ColmapImage, camera: ColmapCamera, file: SourceFile, header: ImageHeader, mask: SourceFile | None
 ) -> Frame:
     def matches(header: ImageHeader) -> bool:
-        return abs(header.height - header.width * camera.height / camera.width) <= ROUNDING
+        return is_scaled(header, camera.width, camera.height)
 
     header = choose_orientation(file, header, matches, prefers_stored=True)  # COLMAP itself turns none
     if not matches(header):
@@ -83,12 +91,6 @@ def _frame(
         raise file.error(problem, "use the images that the model was made of, or scaled ones")
     scaled = camera.intrinsics.scaled(header.width / camera.width, header.height / camera.height)
     return Frame(image.name, file, mask, image.pose, header, scaled)
-
-
-def _find_mask(image: ColmapImage, masks_folder: Path) -> SourceFile | None:
-    names = (f"{image.name}.png", f"{os.path.splitext(image.name)[0]}.png", image.name)
-    name = next((name for name in names if os.path.isfile(masks_folder / name)), None)
-    return None if name is None else locate_file(masks_folder, name, image.location)
 
 
 def _points_of(model: Path, images: list[ColmapImage]) -> list[np.ndarray] | None:

@@ -15,7 +15,7 @@ from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
 from edge_se_sampler.data.memory import ModelMemory
-from edge_se_sampler.data.scene_file import SourceLocation, check_folder
+from edge_se_sampler.data.scene_file import SourceLocation, check_folder, quote
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError, check_value
@@ -49,6 +49,22 @@ def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
     """The format of a folder by what it has, the first of CONTENTS if there are several, or the one that is insisted
     on; InputError if the folder has none, or not that one."""
     check_folder(folder)
+    found = _list_formats(folder)
+    if data_format in found or (data_format == "auto" and found):
+        return found[0] if data_format == "auto" else data_format
+    wanted = CONTENTS if data_format == "auto" else {data_format: CONTENTS[data_format]}
+    problem = "has nothing that lists cameras: no transforms_train.json or the like"
+    if data_format != "auto":
+        problem = f"is no scene in the format {data_format}"
+    hint = "give a folder with " + "; ".join(f"{name}: {content}" for name, content in wanted.items())
+    for inner in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if set(wanted) & set(_list_formats(inner)):
+            hint = f"its folder {quote(inner.name)} has such: give that"
+    raise SourceLocation(folder).error(problem, hint)
+
+
+def _list_formats(folder: Path) -> list[DataFormat]:
+    """The formats for which a folder has something, in the order of CONTENTS."""
     found: list[DataFormat] = []
     if any(transforms_path(folder, split).exists() for split in SPLITS):
         found.append("blender")
@@ -58,14 +74,7 @@ def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
         found.append("colmap")
     if bounds_path(folder).exists():
         found.append("llff")
-    if data_format in found or (data_format == "auto" and found):
-        return found[0] if data_format == "auto" else data_format
-    wanted = CONTENTS if data_format == "auto" else {data_format: CONTENTS[data_format]}
-    problem = "has nothing that lists cameras: no transforms_train.json or the like"
-    if data_format != "auto":
-        problem = f"is no scene in the format {data_format}"
-    hint = "; ".join(f"{name}: {content}" for name, content in wanted.items())
-    raise SourceLocation(folder).error(problem, f"give a folder with {hint}")
+    return found
 
 
 def read_split(
@@ -90,7 +99,10 @@ def read_split(
         return read_blender(folder, split, load, progress)
     capture, rows, eval_every = _read_capture(folder, split, settings, data_format)
     if split == "train" and not rows:
-        raise SourceLocation(folder).error("has no images to train on", "add some, or correct its lists")
+        problem, hint = "has no images to train on", "add some, or correct its lists"
+        if capture.splits is None:
+            problem, hint = "its only image is held out", "add some, or list it in a transforms.json's train_filenames"
+        raise SourceLocation(folder).error(problem, hint)
     if not rows:
         return None
     rows = load.choose(rows)

@@ -5,6 +5,7 @@ No image but those at work is in memory at its full size.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -154,7 +155,9 @@ def load_views(
     if settings.masks == "object" and all(image.shape[2] == 3 for image in images):
         those = f"{quote(frames[0].name)} and the {len(frames) - 1} other views of its split"
         problem = f"{those} have neither masks nor alpha for --masks object"
-        raise listing.error(problem, "add masks, or leave the flag out")
+        raise listing.error(problem, "add masks (masks/1.jpg.png for images/1.jpg), or leave the flag out")
+    if settings.masks == "object":
+        _check_objects(frames, images)
     has_masks = any(mask is not None for mask in masks)
     if has_masks:
         masks = [np.ones(i.shape[:2], dtype=bool) if m is None else m for i, m in zip(images, masks, strict=True)]
@@ -165,6 +168,16 @@ def load_views(
     names = tuple(frame.name for frame in frames)
     cameras = _cameras(frames, settings.downscale)
     return Views(names, tuple(images), tuple(masks) if has_masks else None, cameras, memory=memory)
+
+
+def _check_objects(frames: Sequence[Frame], images: Sequence[np.ndarray]) -> None:
+    """InputError if masks leave no object in any view; says so if views have neither mask nor alpha."""
+    if not any(image.shape[2] == 3 or image[..., 3].any() for image in images):
+        raise frames[0].image.error("and all other views are masked as a whole", "masks are non-zero on the object")
+    whole = [frame for frame, image in zip(frames, images, strict=True) if image.shape[2] == 3]
+    if whole:
+        found = f"{len(whole)} of {len(frames)} views have neither mask nor alpha, {quote(whole[0].name)} for one"
+        print(f"{frames[0].image.location.file}: {found}: all of them counts as the object", file=sys.stderr)
 
 
 def _sizes(frames: Sequence[Frame]) -> np.ndarray:
@@ -208,7 +221,8 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 
 
 def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8: the largest color of the pixels of an image's mask, which is turned as its own orientation says if
+    """(H, W) uint8: the largest color of the pixels of an image's mask or, where that is the same everywhere, their
+    alpha; 255 in place of the one number that a mask may have beside 0. It is turned as its own orientation says if
     that gives it the image's size."""
     height, width = size = image.shape[:2]
     header = choose_orientation(
@@ -216,10 +230,14 @@ def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     )
     found = header.height, header.width
     if found == size or header.height * header.width <= MAX_MISFIT:
-        colors = turn_upright(read_image(file), header.orientation)[..., :3]  # without alpha: an opaque black one masks
-        found = colors.shape[:2]
+        pixels = turn_upright(read_image(file), header.orientation)
+        found = pixels.shape[:2]
         if found == size:
-            return colors.max(axis=2)
+            values = pixels[..., :3].max(axis=2)
+            if pixels.shape[2] == 4 and values.min() == values.max() and (pixels[..., 3] != pixels[0, 0, 3]).any():
+                values = pixels[..., 3]
+            is_binary = ((values == 0) | (values == values.max())).all()
+            return np.where(values > 0, np.uint8(255), np.uint8(0)) if is_binary else values
     problem = f"is {found[1]} x {found[0]} pixels, its image {width} x {height}"
     raise file.error(problem, "give the mask the size of its image")
 

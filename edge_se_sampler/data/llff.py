@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_se_sampler.data.capture import Capture
-from edge_se_sampler.data.colmap import ROUNDING, find_images
+from edge_se_sampler.data.colmap import find_images, is_scaled, list_visible
 from edge_se_sampler.data.frames import MAX_POSITION, Frame, choose_orientation, read_headers
 from edge_se_sampler.data.image_file import ImageHeader
 from edge_se_sampler.data.lens import Intrinsics
@@ -33,13 +33,15 @@ def read_llff(folder: Path) -> Capture:
     InputError for files that cannot be used, or if there is not one image for each pose."""
     rows, location = _read_rows(bounds_path(folder)), SourceLocation(bounds_path(folder))
     images = find_images(folder)
-    names = sorted(path.name for path in images.iterdir() if path.suffix.lower() in SUFFIXES)
+    names = sorted(name for name in list_visible(images) if Path(name).suffix.lower() in SUFFIXES)
     if len(names) != len(rows):
         problem = f"has {len(rows)} poses, {images.name} has {len(names)} images"
         raise location.error(problem, "put the images there that the poses were found with, and no others")
     files = [locate_file(images, name, location.item(i)) for i, name in enumerate(names)]
     items = zip(files, read_headers(files), rows, strict=True)
-    frames = [_frame(folder, file, header, row) for file, header, row in items]
+    frames = [
+        _frame(file, find_mask(folder, f"{images.name}/{file.name}", file), header, row) for file, header, row in items
+    ]
     points = [_points(frame.pose, row[15:]) for frame, row in zip(frames, rows, strict=True)]
     return Capture(frames, [], points=points)
 
@@ -75,12 +77,12 @@ def _check_row(row: np.ndarray, location: SourceLocation) -> None:
         raise location.error(f"its depths are {near:g} and {far:g}, not 0 < near < far", hint)
 
 
-def _frame(folder: Path, file: SourceFile, header: ImageHeader, row: np.ndarray) -> Frame:
+def _frame(file: SourceFile, mask: SourceFile | None, header: ImageHeader, row: np.ndarray) -> Frame:
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
 
     def matches(header: ImageHeader) -> bool:
-        return abs(header.height - header.width * height / width) <= ROUNDING
+        return is_scaled(header, width, height)
 
     header = choose_orientation(file, header, matches)
     if not matches(header):
@@ -88,7 +90,7 @@ def _frame(folder: Path, file: SourceFile, header: ImageHeader, row: np.ndarray)
         raise file.error(problem, "use the images that the poses were found with, or scaled ones")
     pose = np.stack((matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]), axis=1)
     camera = Intrinsics(focal, focal, width / 2, height / 2).scaled(header.width / width, header.height / height)
-    return Frame(file.name, file, find_mask(folder, file), pose, header, camera)
+    return Frame(file.name, file, mask, pose, header, camera)
 
 
 def _points(pose: np.ndarray, depths: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from edge_se_sampler.data.scene_file import SourceFile, locate_file
@@ -21,10 +22,22 @@ def place_of_mask(folder: Path, image: Path) -> Path:
     return place.with_name(f"{place.name}.png")
 
 
-def find_mask(folder: Path, image: SourceFile) -> SourceFile | None:
-    """The mask of an image for which the scene lists none; None: there is none either. InputError if it lies outside
-    the folder."""
-    if not image.path.is_relative_to(os.path.realpath(folder)):
-        return None
-    place = place_of_mask(folder, image.path)
-    return locate_file(folder, str(place.relative_to(folder)), image.location) if os.path.isfile(place) else None
+def find_mask(folder: Path, listed: str, image: SourceFile) -> SourceFile | None:
+    """The mask of an image, listed under a path in the folder, for which the scene lists none: named as the image or,
+    if that is a link, as its file, with .png added or in place of the suffix, or alike. None: there is none either.
+    InputError if it lies outside the folder."""
+    place = next((place for place in _places(folder, listed, image) if os.path.isfile(folder / place)), None)
+    return None if place is None else locate_file(folder, str(place), image.location)
+
+
+def _places(folder: Path, listed: str, image: SourceFile) -> Iterator[Path]:
+    """Where in the folder the mask of an image may lie."""
+    root = os.path.realpath(folder)
+    own = [image.path.relative_to(root)] if image.path.is_relative_to(root) else []
+    for path in dict.fromkeys((Path(os.path.normpath(listed)), *own)):
+        first, *rest = path.parts
+        inside = bool(rest) and first.split("_")[0] == "images"
+        parts = rest if inside else path.parts
+        for masks in dict.fromkeys((first.replace("images", "masks"), "masks") if inside else ("masks",)):
+            place = Path(masks, *parts)
+            yield from (place.with_name(f"{place.name}.png"), place.with_suffix(".png"), place)

@@ -32,6 +32,9 @@ def read_transforms(folder: Path) -> Capture:
     splits = _read_splits(top, listed)
     entries, left_out = keep_existing(listed, [entry.image for entry in listed], top.required("frames", "").location)
     entries.sort(key=lambda entry: entry.file_path)
+    if others := top.optional("test_frames"):
+        found = f"{len(others.list())} held-out images are left out: only frames are read"
+        left_out.append(f"{others.location.file}: {others.location.field}: {found}")
     if splits is None:
         return Capture(read_frames(entries), left_out)
     keys = [_key(entry.file_path) for entry in entries]

@@ -111,7 +111,7 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
         location=entry.location,
         file_path=path,
         image=image,
-        mask=find_mask(folder, image)
+        mask=find_mask(folder, image.name, image)
         if mask_path is None
         else _locate(_read_path(mask_path, folder), folder, mask_path.location),
         pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),

@@ -62,7 +62,10 @@ def find_depths(views: Views) -> DepthRange:
         or _depths_of_cameras(views)
     )
     if found is None:
-        raise InputError("neither points, silhouettes nor cameras tell how deep the scene is: give both near and far")
+        raise InputError(
+            "neither points, silhouettes nor cameras tell how deep the scene is: give --pipeline.model.near and "
+            "--pipeline.model.far (of inspect: --near and --far)"
+        )
     return found
 
 
