@@ -42,7 +42,7 @@ def lean_nerf() -> MethodSpecification:
     adam = OptimizerConfig(eps=1e-15, beta2=0.99, warmup_steps=20, fused=True)
     config = TrainerConfig(
         method_name="lean-nerf",
-        steps_per_save=20_000,
+        steps_per_save=5_000,
         steps_per_log=50,
         pipeline=PipelineConfig(manager, LeanModelConfig()),
         optimizer=adam,

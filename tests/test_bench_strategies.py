@@ -284,8 +284,10 @@ def test_one_place_where_a_strategy_is_better_is_a_use_of_it() -> None:
         for seed, offset in enumerate(offsets):
             more = {"downscale": downscale, "size": [800 // downscale] * 2}
             runs += [run_of(25 + seed / 10, seed, **more), run_of(25 + offset, seed, "edge", **more)]
-    expected = "yes, better: lean (200 px); worse: lean (100 px); not distinguishable in 1 of 4"
+    expected = "only where it is better: lean (200 px); worse: lean (100 px); not distinguishable in 1 of 4"
     assert describe_use(runs, "edge") == f"{expected}; no verdict (too few seeds) in 1 of 4"
+    nowhere_worse = [run for run in runs if run["downscale"] != 8]
+    assert describe_use(nowhere_worse, "edge").startswith("yes, better: lean (200 px); not distinguishable")
     less = [run for run in runs if run["downscale"] >= 8]
     assert describe_use(less, "edge") == "no, worse: lean (100 px); not distinguishable in 1 of 2"
     assert describe_use(less, "se") == "–"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +18,7 @@ from tiny import ball_views, tiny_trainer
 
 from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, override
 from edge_se_sampler.methods import method_configs
-from edge_se_sampler.models import voxel_backend, voxel_kernels, voxel_ops
+from edge_se_sampler.models import compilation, voxel_backend, voxel_kernels, voxel_ops
 from edge_se_sampler.models.compilation import compile_ops
 from edge_se_sampler.models.lean import ColorNetwork
 from edge_se_sampler.models.voxel_kernels import rendering
@@ -279,6 +280,27 @@ def test_compiling_leaves_torch_s_global_generator_alone() -> None:
     before = torch.get_rng_state()
     compile_ops("cpu")
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 30.0])
+def test_compiling_that_takes_long_is_said_at_once(
+    seconds: float, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = []
+    monkeypatch.setattr(compilation, "SILENT_SECONDS", seconds)
+    monkeypatch.setattr(compilation, "_call_all", lambda _: said.append(wait_until_said(capsys) if not seconds else ""))
+    compile_ops("cpu")
+    assert [compilation.NOTICE in text for text in said] == [not seconds]
+    assert compilation.NOTICE not in capsys.readouterr().err
+
+
+def wait_until_said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What is on stderr, as soon as there is something; at most 10 s."""
+    for _ in range(200):
+        if text := capsys.readouterr().err:
+            return text
+        time.sleep(0.05)
+    return ""
 
 
 THREADS = """

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-import time
+from threading import Timer
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -15,13 +16,23 @@ from edge_se_sampler.models.voxel_backend import compiled_ops
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.occupancy.subdivision import subdivide
 
+SILENT_SECONDS = 5.0
+NOTICE = "edge-se: compiling the kernels, which takes half a minute or two; they are kept for the next time"
+
 
 def compile_ops(device: str) -> None:
-    """Compile the kernels for models on a device, if there are any, and say how long it took if it took long: numba
-    keeps them for the next time."""
-    ops, began = device == "cpu" and compiled_ops(), time.monotonic()
-    if not ops:
-        return
+    """Compile the kernels for models on a device, if there are any, and say so if it takes long: numba keeps them for
+    the next time."""
+    if device == "cpu" and (ops := compiled_ops()):
+        notice = Timer(SILENT_SECONDS, lambda: print(NOTICE, file=sys.stderr, flush=True))
+        notice.start()
+        try:
+            _call_all(ops)
+        finally:
+            notice.cancel()
+
+
+def _call_all(ops: ModuleType) -> None:
     cells = torch.ones((1, 1, 1), dtype=torch.bool)
     grid = BrickGrid.from_cells(torch.zeros(3), 1.0, cells, max_level=1)
     model = LeanModel(LeanModelConfig(size="tiny", near=0.0), np.random.default_rng(0), grid)
@@ -34,5 +45,3 @@ def compile_ops(device: str) -> None:
         ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
         ops.find_dense_cells(grid, weight.data, 0.0)
         ops.resample(subdivide(grid, cells, 0.5).bricks, 0.5, grid.numbers, weight.data)
-    if time.monotonic() - began > 5:
-        print(f"edge-se: compiled the kernels in {time.monotonic() - began:.0f} s; they are kept", file=sys.stderr)

@@ -38,7 +38,7 @@ VERDICTS: dict[Verdict | None, str] = {
     "same": "not distinguishable",
     None: "no verdict (too few seeds)",
 }
-"""In words; the first that a strategy has anywhere says whether to use it."""
+"""In words; the first that a strategy has anywhere says whether to use it, there alone if it is worse elsewhere."""
 ANSWERS: dict[Verdict | None, str] = {"better": "yes, ", "worse": "no, ", "same": "no need, ", None: ""}
 
 
@@ -115,7 +115,8 @@ def describe_use(runs: list[Run], strategy: str) -> str:
         else f"{VERDICTS[verdict]} in {len(where[verdict])} of {len(found)}"
         for verdict in judged
     ]
-    return ANSWERS[judged[0]] + "; ".join(texts)
+    answer = "only where it is " if {"better", "worse"} <= set(judged) else ANSWERS[judged[0]]
+    return answer + "; ".join(texts)
 
 
 def _name_panels(some: list[str], compared: list[str]) -> str:
