@@ -92,7 +92,7 @@ class TrainerConfig(InstantiateConfig):
     experiment_name: str | None = None
     """Name of the experiment; by default the data folder's name."""
     max_num_iterations: int | None = None
-    """Planned iterations, which determine phases and learning rate; by default the model size's."""
+    """Planned iterations, which determine phases and learning rate; by default those of --pipeline.model.size."""
     new_num_iterations: Annotated[int | None, tyro.conf.Suppress] = field(default=None, metadata=ADDED_LATER)
     """Planned iterations since `edge-se resume --max-num-iterations`, by which the early phase is no longer."""
     time_budget: str | None = None
