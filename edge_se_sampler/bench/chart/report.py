@@ -83,14 +83,13 @@ def _group_table(runs: list[Run], group: str, baselines: Baselines, costs: bool 
     """The scenes that a group is compared on, and its variants, and baselines beside methods: PSNR, failures, costs."""
     compared = comparable(by_variant(runs, TOP if group in TOP else [group]))
     scenes = scenes_of(chain(*compared.values()))
+    longest = max((run["seconds"] for run in runs), default=0.0)
+    moments = [seconds for seconds in COLUMNS if seconds == END or 1.05 * seconds < longest]
     shown = {
         VARIANTS[n].label: found for n, found in compared.items() if VARIANTS[n].group == group or n == RECOMMENDED
     }
     if group == "methods":
         shown |= {label: found for label, all_runs in baselines.items() if (found := runs_on(all_runs, scenes))}
-    looks = [row[0] for run in chain(*shown.values()) for row in run["curve"]]
-    # between looks that are farther off PSNR would be a guess: a budget of 7 s is not among trainings of 10
-    moments = [s for s in COLUMNS if s == END or any(0.9 * s < look < 1.1 * s < max(looks) for look in looks)]
     rows = []
     for label, found in shown.items():
         psnr = [decimals(mean_psnr_at(found, seconds)) for seconds in moments]
