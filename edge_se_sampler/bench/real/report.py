@@ -123,7 +123,7 @@ def _table_of_psnr(runs: list[Run]) -> str:
 
 
 def _table_of_baselines(runs: list[Run], baselines: Baselines) -> str:
-    """Ours and other programs where both were trained, at the seconds of our budgets there; empty where none was."""
+    """Ours and other programs where both were trained, at the seconds of our budgets; empty where none was."""
     budgets, rows = _budgets(runs), []
     for panel in panels_of(runs):
         ours = [run for run in runs if panel_of(run) == panel]
@@ -133,7 +133,7 @@ def _table_of_baselines(runs: list[Run], baselines: Baselines) -> str:
             psnr[name_of(variant)] = {budget: statistics.median(of_seeds) for budget, of_seeds in found.items()}
         programs = by_program(baselines, panel)
         for name, trainings in programs.items():
-            psnr[name] = {budget: best_psnr_at(trainings, seconds_of(budget)) for budget in _budgets(ours)}
+            psnr[name] = {budget: best_psnr_at(trainings, seconds_of(budget)) for budget in budgets}
         rows += [
             [label_of(panel), name, *(decimals(found.get(budget)) for budget in budgets)]
             for name, found in psnr.items()
