@@ -197,7 +197,7 @@ def test_other_programs_stand_beside_ours_at_equal_seconds(tmp_path: Path) -> No
     assert "| lego, 400 px | lean-nerf | 30.00 | 32.00 | – | 33.00 |" in page
     assert "| lego, 400 px | lean-nerf, no hull | – | 31.00 | – | – |" in page
     assert "| lego, 400 px | other (1) | 20.00 | 25.00 | – | 26.00 |" in page
-    assert "| fox, 270 x 480 px | other (1) | – | – | 18.00 | – |" in page  # nobody looked after 60 s
+    assert "| fox, 270 x 480 px | other (1) | – | – | 18.00 | 19.00 |" in page  # nobody looked after 60 s
     assert "chair, 400 px | lean-nerf |" not in page  # nobody else was there
 
 
