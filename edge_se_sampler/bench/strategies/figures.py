@@ -47,7 +47,8 @@ def draw_differences(runs: list[Run], labels: dict[Panel, str]) -> Any:
     for axis in axes.flat:
         handles |= {label: mark for mark, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    title = "test PSNR minus that of uniform pixels [dB]\nlines: least to greatest of scenes and seeds"
+    title = "test PSNR minus that of uniform pixels [dB]; where axes end at 10, they are logarithmic beyond 1"
+    title += "\nlines: least to greatest of scenes and seeds"
     figure.suptitle(title, fontsize=9)
     return figure
 
