@@ -20,9 +20,9 @@ ENTRY_POINT_GROUP = "edge_se_sampler.method_configs"
 
 STRATEGIES = {
     "vanilla-nerf": ("uniform", "uniform", "Random: NeRF with pixels drawn uniformly"),
-    "precrop-nerf": ("precrop", "uniform", "Precrop + Random: the centre of the image first"),
+    "precrop-nerf": ("precrop", "uniform", "Precrop + Random: the center of the image first"),
     "se-nerf": ("uniform", "se", "SE: uniform first, then by the rank of the squared error"),
-    "precrop-se-nerf": ("precrop", "se", "Precrop + SE: the centre first, then by squared error"),
+    "precrop-se-nerf": ("precrop", "se", "Precrop + SE: the center first, then by squared error"),
     "edge-nerf": ("edge", "uniform", "Edge: by edge strength first, then uniformly"),
     "edge-se-nerf": ("edge", "se", "Edge + SE: by edge strength first, then by squared error"),
 }

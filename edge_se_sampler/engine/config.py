@@ -113,7 +113,8 @@ class TrainerConfig(InstantiateConfig):
     steps_per_log: int = 10
     """Iterations between lines of metrics.jsonl."""
     reinit_dead: bool = False
-    """Reinitialize a dead network (density 0 everywhere, hence no gradient) from the seed's next sub-seed."""
+    """Reinitialize a dead network (density 0 everywhere, hence no gradient), each time with other random numbers of the
+    seed."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
