@@ -28,9 +28,9 @@ class SamplingSettings:
 
     early: EarlyStrategy = "edge"
     """How pixels are drawn in the early phase: uniformly, from the center of the image, in proportion to edge
-    strength, or as the errors tell that training found (see the README of edge_se_sampler/sampling); auto: uniformly where
-    lean-nerf knows from alpha where the object is, otherwise by edges, under the adaptive schedule unless that is
-    steps."""
+    strength, or as the errors tell that training found (see the README of edge_se_sampler/sampling); auto: uniformly
+    where lean-nerf knows from alpha where the object is, otherwise by edges, under the adaptive schedule unless that
+    is steps."""
     late: LateStrategy = "se"
     """How pixels are drawn afterwards: uniformly, by the rank of their squared error among uniform candidates, or as
     the errors tell that training found. The same name as early's: all the time."""
