@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,9 +58,9 @@ def find_format(folder: Path, data_format: DataFormat = "auto") -> DataFormat:
     if data_format != "auto":
         problem = f"is no scene in the format {data_format}"
     hint = "give a folder with " + "; ".join(f"{name}: {content}" for name, content in wanted.items())
-    for inner in sorted(path for path in folder.iterdir() if path.is_dir()):
-        if set(wanted) & set(_list_formats(inner)):
-            hint = f"its folder {quote(inner.name)} has such: give that"
+    inner = sorted(path for path in folder.iterdir() if os.access(path / ".", os.R_OK | os.X_OK))
+    if scene := next((path.name for path in inner if set(wanted) & set(_list_formats(path))), None):
+        hint = f"its folder {quote(scene)} has such: give that"
     raise SourceLocation(folder).error(problem, hint)
 
 
