@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,21 @@ class TestPixels:
         line = refusal(tmp_path / "scene", tmp_path / "out")
         assert "transforms_train.json: frames[1].file_path: './train/r_1.png' has no plain background" in line
         assert "RGBA" in line
+
+    @pytest.mark.parametrize("split", ["train", "test"])
+    def test_an_image_that_is_missing_is_refused(
+        self, split: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        doc = write_scene(tmp_path / "scene")
+        for i, frame in enumerate(doc["frames"]):
+            frame["file_path"] = f"test/{i}.png"
+            (tmp_path / "scene/test").mkdir(exist_ok=True)
+            iio.imwrite(tmp_path / f"scene/test/{i}.png", WHITE)
+        write_json(tmp_path / "scene", doc, "test")
+        (tmp_path / "scene" / ("train/r_1.png" if split == "train" else "test/1.png")).unlink()
+        line = refusal(tmp_path / "scene", tmp_path / "out")
+        assert re.search(rf"transforms_{split}.json: frames\[1\].file_path: '.*1.png' does not exist", line)
+        assert not capsys.readouterr().err
 
     def test_masks_hide_the_padding(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")

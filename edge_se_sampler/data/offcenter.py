@@ -142,40 +142,39 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
     """The files of each split, all read to the end; InputError for what cannot be copied as promised."""
     plan: dict[Split, Files] = {}
     written: dict[str, tuple[str, str]] = {}
-    cut_off: list[tuple[JsonValue, int]] = []
+    cut_off: list[tuple[Entry, int]] = []
     needed = np.zeros(2)  # padding, over all views
     found: tuple[Split, ...] = tuple(split for split in SPLITS if has_views(data, split))
-    for split in found or SPLITS[:1]:  # where there is none, the loader says so
-        views = read_blender(data, split)
+    if not found:
+        read_blender(data, "train")  # says that there is none
+    for split in found:
         top = read_json(transforms_path(data, split))
         frames = top.required("frames", "").list()
         entries = read_entries(top, data)
         for entry in entries:
+            if not os.path.exists(entry.image.path):
+                raise entry.image.error("does not exist", "put the file there, or list only what is there")
             if read_lens(entry.intrinsics) is not None:
                 raise entry.location.error("its lens distorts", "undistort the images, and leave its coefficients out")
+        views = read_blender(data, split)
         plan[split] = [_output_files(data, *each, written) for each in zip(frames, entries, strict=True)]
-        for image, frame in zip(views.images, frames, strict=True):
+        for image, entry in zip(views.images, entries, strict=True):
             background = plain_background(image)
             if background is None:
                 problem = "has no plain background: the pixels of its border differ"
-                raise _image_error(frame, problem, "cut the object out (RGBA), or make the border one color")
+                raise entry.image.error(problem, "cut the object out (RGBA), or make the border one color")
             foreground = image[..., 3] > 0 if image.shape[2] == 4 else np.any(image != background, axis=-1)
             canvas = Canvas.of(image, shift, pad)
             needed = np.maximum(needed, canvas.min_pad(foreground))
             kept = foreground[canvas.visible(canvas.corners["shifted"])]
             if count := np.count_nonzero(foreground) - np.count_nonzero(kept):
-                cut_off.append((frame, count))
+                cut_off.append((entry, count))
     if cut_off:
-        frame, count = cut_off[0]
+        entry, count = cut_off[0]
         more = f" ({len(cut_off)} views would lose some)" if cut_off[1:] else ""
         problem = f"would lose {count} pixel{'' if count == 1 else 's'} of its object past the edge of the canvas{more}"
-        raise _image_error(frame, problem, f"give at least --pad {needed[0]:g} {needed[1]:g}, or no --pad")
+        raise entry.image.error(problem, f"give at least --pad {needed[0]:g} {needed[1]:g}, or no --pad")
     return plan
-
-
-def _image_error(frame: JsonValue, problem: str, hint: str) -> InputError:
-    listed = quote(listed_file(frame.value["file_path"]))
-    return frame.location.member("file_path").error(f"{listed} {problem}", hint)
 
 
 def _output_files(data: Path, frame: JsonValue, entry: Entry, written: dict[str, tuple[str, str]]) -> dict[str, str]:
