@@ -241,7 +241,7 @@ def test_a_model_without_images(tmp_path: Path) -> None:
 def test_a_model_without_one_of_its_files(missing: str, tmp_path: Path) -> None:
     write_colmap(tmp_path)
     (tmp_path / "sparse/0" / missing).unlink()
-    assert re.search("images.txt: does not exist|nothing that lists cameras", refusal(tmp_path))
+    assert re.search("images.bin: does not exist|nothing that lists cameras", refusal(tmp_path))
 
 
 def test_an_image_of_another_shape_or_damaged(tmp_path: Path) -> None:

@@ -113,8 +113,9 @@ def read_points(model: Path) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _file_of(model: Path, name: str) -> Path:
-    binary = model / f"{name}.bin"
-    return binary if binary.exists() else model / f"{name}.txt"
+    binary, text = model / f"{name}.bin", model / f"{name}.txt"
+    is_binary = binary.exists() or ((model / "cameras.bin").exists() and not text.exists())
+    return binary if is_binary else text
 
 
 def _size_of(model: Path, name: str) -> int:
