@@ -106,12 +106,26 @@ def test_soft_masks_stay_soft(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], soft)
 
 
+def test_black_and_white_of_jpegs_are_rounded(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    (tmp_path / "masks").mkdir()
+    nearly = np.where(half_mask() > 0, np.uint8(251), np.uint8(3))
+    for name in NAMES:
+        (tmp_path / "masks" / name).write_bytes(iio.imwrite("<bytes>", nearly, extension=".jpg"))
+    masks = read(tmp_path).masks
+    assert masks is not None
+    np.testing.assert_array_equal(masks[0], half_mask() > 0)
+    np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], half_mask())
+
+
 @pytest.mark.parametrize(
     ("listed", "mask"),
     [
         ("images/a.jpg", "masks/a.jpg.png"),
         ("images/a.jpg", "masks/a.png"),
         ("images/a.jpg", "masks/a.jpg"),
+        ("images/a.jpg", "masks/a_mask.png"),
+        ("images/a.jpg", "masks/a_mask.jpg"),
         ("./images/b/a.jpg", "masks/b/a.png"),
         ("images_4/a.jpg", "masks_4/a.png"),
         ("images_4/a.jpg", "masks/a.png"),
@@ -153,6 +167,20 @@ def test_views_without_a_mask_are_said_to_be_object_as_a_whole(
         iio.imwrite(tmp_path / "masks" / name, half_mask())
     read(tmp_path, masks="object")
     assert "2 of 7 views have neither mask nor alpha, 'images/view 06.png' for one" in capsys.readouterr().err
+    read(tmp_path)
+    assert not capsys.readouterr().err
+
+
+def test_masks_that_no_image_has_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    read(tmp_path)
+    assert not capsys.readouterr().err
+    for name in NAMES:
+        iio.imwrite(tmp_path / "masks" / f"silhouette of {name}", half_mask())
+    read(tmp_path)
+    assert f"has {len(NAMES)} files, 'silhouette of view 0" in capsys.readouterr().err
+    iio.imwrite(tmp_path / "masks" / NAMES[0], half_mask())
     read(tmp_path)
     assert not capsys.readouterr().err
 

@@ -15,6 +15,7 @@ from edge_se_sampler.data.colmap_model import find_models
 from edge_se_sampler.data.config import DataFormat, Masks
 from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
+from edge_se_sampler.data.mask_files import describe_unused_masks
 from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.scene_file import SourceLocation, check_folder, quote
 from edge_se_sampler.data.transforms import read_transforms
@@ -129,8 +130,9 @@ def _read_capture(
     which. With the training split it is said what was left out."""
     capture = READERS[data_format](folder)
     _check_unsplit(settings, has_own_split=capture.splits is not None)
-    for line in capture.left_out if split == "train" else []:
-        print(line, file=sys.stderr)
+    if split == "train":
+        for line in (*capture.left_out, *describe_unused_masks(folder, capture.frames)):
+            print(line, file=sys.stderr)
     every = EVAL_EVERY if settings.eval_every is None else settings.eval_every
     return capture, capture.select(split, every), every if capture.splits is None else None
 

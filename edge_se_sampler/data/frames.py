@@ -222,8 +222,8 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 
 def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8: the largest color of the pixels of an image's mask or, where that is the same everywhere, their
-    alpha; 255 in place of the one number that a mask may have beside 0. It is turned as its own orientation says if
-    that gives it the image's size."""
+    alpha; 255 in place of the one number that a mask may have beside 0. A JPEG's, in which black need not be 0, is 0
+    or 255, whichever half it is in. It is turned as its own orientation says if that gives it the image's size."""
     height, width = size = image.shape[:2]
     header = choose_orientation(
         file, read_header(file), lambda header: (header.width, header.height) == (width, height)
@@ -236,6 +236,8 @@ def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
             values = pixels[..., :3].max(axis=2)
             if pixels.shape[2] == 4 and values.min() == values.max() and (pixels[..., 3] != pixels[0, 0, 3]).any():
                 values = pixels[..., 3]
+            if header.is_lossy:
+                values = values & np.uint8(128)
             is_binary = ((values == 0) | (values == values.max())).all()
             return np.where(values > 0, np.uint8(255), np.uint8(0)) if is_binary else values
     problem = f"is {found[1]} x {found[0]} pixels, its image {width} x {height}"

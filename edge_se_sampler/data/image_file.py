@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import imageio.v3 as iio
@@ -36,12 +36,12 @@ class ImageHeader:
     """3 or 4, as `read_image` returns them."""
     orientation: int = 1
     """EXIF's: how programs that heed it turn the pixels; 1: not at all, 5 to 8: by a quarter (EXIF 2.3, tag 274)."""
+    is_lossy: bool = False
+    """Whether it is a JPEG, whose pixels are near those that were saved."""
 
     def upright(self) -> ImageHeader:
         """The header of the image that is turned as its orientation says."""
-        swapped = self.orientation >= 5
-        size = (self.height, self.width) if swapped else (self.width, self.height)
-        return ImageHeader(*size, self.channels, self.orientation)
+        return replace(self, width=self.height, height=self.width) if self.orientation >= 5 else self
 
 
 def read_header(file: SourceFile) -> ImageHeader:
@@ -54,10 +54,11 @@ def read_header(file: SourceFile) -> ImageHeader:
             # pillow decodes a PNG whole to look for EXIF behind the pixels
             may_be_turned = image.format != "PNG" or _may_have_exif(file.path.read_bytes())
             orientation = image.getexif().get(_ORIENTATION, 1) if may_be_turned else 1
+            is_lossy = image.format != "PNG"
     except Exception:  # decoding says what is wrong
         height, width, channels = read_image(file).shape
         return ImageHeader(width, height, channels)
-    return ImageHeader(width, height, channels, orientation if orientation in range(1, 9) else 1)
+    return ImageHeader(width, height, channels, orientation if orientation in range(1, 9) else 1, is_lossy)
 
 
 def _may_have_exif(png: bytes) -> bool:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from edge_se_sampler.data.scene_file import SourceFile, locate_file
+from edge_se_sampler.data.frames import Frame
+from edge_se_sampler.data.scene_file import SourceFile, locate_file, quote
 
 
 def place_of_mask(folder: Path, image: Path) -> Path:
@@ -24,8 +25,8 @@ def place_of_mask(folder: Path, image: Path) -> Path:
 
 def find_mask(folder: Path, listed: str, image: SourceFile) -> SourceFile | None:
     """The mask of an image, listed under a path in the folder, for which the scene lists none: named as the image or,
-    if that is a link, as its file, with .png added or in place of the suffix, or alike. None: there is none either.
-    InputError if it lies outside the folder."""
+    if that is a link, as its file, with .png added or in place of the suffix, or alike; or so with _mask behind the
+    name, as Metashape writes them. None: there is none either. InputError if it lies outside the folder."""
     place = next((place for place in _places(folder, listed, image) if os.path.isfile(folder / place)), None)
     return None if place is None else locate_file(folder, str(place), image.location)
 
@@ -41,3 +42,13 @@ def _places(folder: Path, listed: str, image: SourceFile) -> Iterator[Path]:
         for masks in dict.fromkeys((first.replace("images", "masks"), "masks") if inside else ("masks",)):
             place = Path(masks, *parts)
             yield from (place.with_name(f"{place.name}.png"), place.with_suffix(".png"), place)
+            yield from (place.with_name(f"{place.stem}_mask{suffix}") for suffix in (".png", place.suffix))
+
+
+def describe_unused_masks(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """A line if the folder has files where masks lie, but no frame has one."""
+    files = [path for path in (folder / "masks").glob("**/*") if path.is_file() and not path.name.startswith(".")]
+    if not files or any(frame.mask is not None for frame in frames):
+        return []
+    found = f"has {len(files)} files, {quote(min(files).name)} for one, that are named after none of the images"
+    return [f"{folder / 'masks'}: {found}: left out (masks/1.jpg.png would be the mask of images/1.jpg)"]
