@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import TypeVar
 
 import numpy as np
@@ -233,7 +233,7 @@ def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
         pixels = turn_upright(read_image(file), header.orientation)
         found = pixels.shape[:2]
         if found == size:
-            values = pixels[..., :3].max(axis=2)
+            values = reduce(np.maximum, np.moveaxis(pixels[..., :3], 2, 0))  # max(axis=2) is slow
             if pixels.shape[2] == 4 and values.min() == values.max() and (pixels[..., 3] != pixels[0, 0, 3]).any():
                 values = pixels[..., 3]
             if header.is_lossy:
