@@ -47,8 +47,10 @@ def _places(folder: Path, listed: str, image: SourceFile) -> Iterator[Path]:
 
 def describe_unused_masks(folder: Path, frames: Sequence[Frame]) -> list[str]:
     """A line if the folder has files where masks lie, but no frame has one."""
+    if any(frame.mask is not None for frame in frames):
+        return []
     files = [path for path in (folder / "masks").glob("**/*") if path.is_file() and not path.name.startswith(".")]
-    if not files or any(frame.mask is not None for frame in frames):
+    if not files:
         return []
     found = f"has {len(files)} files, {quote(min(files).name)} for one, that are named after none of the images"
     return [f"{folder / 'masks'}: {found}: left out (masks/1.jpg.png would be the mask of images/1.jpg)"]
