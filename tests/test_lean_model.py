@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from tiny import ball_views, tiny_rays, tiny_trainer
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.data.views import Views
-from edge_se_sampler.engine.rendering import render_outputs
-from edge_se_sampler.models import voxel_backend
+from edge_se_sampler.engine.rendering import render_outputs, render_rays
+from edge_se_sampler.models import lean, voxel_backend, voxel_ops
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import INITIAL_DEPTH_CARVED, INITIAL_RAW_DENSITY, LeanModel
 from edge_se_sampler.models.ray_spans import find_spans
+from edge_se_sampler.models.voxel_ops import RaySpans
 from edge_se_sampler.occupancy.bricks import BrickGrid
 
 
@@ -164,6 +166,26 @@ def test_a_pixel_has_more_rays_at_last_if_all_were_trained_on_often_enough(
         supersampled.append(bool(model.supersampled))
         assert sampler.num_rays_per_batch == (16 if supersampled[-1] else 64)
     assert supersampled == [begin is not None and step >= begin for step in range(50)]
+
+
+@pytest.mark.parametrize("supersampled", [False, True])
+def test_plain_torch_looks_at_so_many_steps_at_once(supersampled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, counts, march = full_model().eval(), [], voxel_ops.march
+    model.supersampled.fill_(supersampled)
+    assert model.rays_per_chunk == 2**16
+
+    def counted(grid: Any, density: Any, spans: RaySpans, jitter: Any, marching: voxel_ops.Marching) -> Any:
+        counts.append(len(spans.begin) * float((spans.end - spans.begin).max()) / marching.step)
+        return march(grid, density, spans, jitter, marching)
+
+    monkeypatch.setattr(lean, "choose_ops", lambda _: voxel_ops)
+    monkeypatch.setattr(lean, "MAX_STEPS", 2000)
+    monkeypatch.setattr(voxel_ops, "march", counted)
+    rays = tiny_rays(300, dtype=torch.float32)
+    rendered = render_rays(model.train(), rays)
+    assert len(counts) > 5
+    assert 100 < max(counts) <= 2000
+    torch.testing.assert_close(rendered, model.eval()(rays)["rgb_fine"], rtol=0, atol=1e-6)
 
 
 def test_outputs_in_evaluation_do_not_depend_on_chunks() -> None:

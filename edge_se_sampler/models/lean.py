@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
+from edge_se_sampler.models import voxel_ops
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.levels import LAST_PRUNING, UNSETTLED, find_level, find_level_end
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
@@ -56,6 +57,8 @@ pixel of the training images that shows something: what is hardly seen is not le
 with more numbers than there are in the images the model remembers rather than learns."""
 MAX_RATIO = 0.85
 """Cells that would be larger than this part of the present ones are not worth subdividing."""
+MAX_STEPS = 2**24
+"""Steps along rays, in cells or not, that plain torch looks at at once; each takes about 100 bytes."""
 ROWS_RATIO = 4
 """How many times as many rows cells have once they are halved: surfaces are layers of them."""
 BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
@@ -122,7 +125,11 @@ class LeanModel(RayModel):
 
     @property
     def rays_per_chunk(self) -> int:
-        return 2**16
+        """Fewer where plain torch, which looks at all steps of all rays at once, renders views: a pixel has up to 4."""
+        if self.training or choose_ops(self.density) is not voxel_ops:
+            return 2**16
+        longest = math.hypot(*self.grid.size.tolist()) / self.config.step_size_voxels
+        return max(1, min(2**16, int(MAX_STEPS / (4 * longest))))
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The network; density and features learn faster, for each sees few samples."""

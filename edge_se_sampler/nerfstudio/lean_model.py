@@ -216,7 +216,7 @@ class LeanNerfModelConfig(ModelConfig):
     """The settings of the standalone program."""
     enable_collider: bool = False
     """Depths come from the scene, see near and far."""
-    eval_num_rays_per_chunk: int = 2**14
+    eval_num_rays_per_chunk: int = 2**12
     """Rays that are rendered at once in evaluation."""
 
 

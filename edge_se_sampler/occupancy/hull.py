@@ -94,7 +94,7 @@ def find_box(views: Views, near: float, far: float) -> Box:
         depth = ((center - position) * forward).sum(axis=1)
     half_extent = float(np.maximum(far - depth, depth - near).clip(min=0).max())
     focal = (views.cameras.fx + views.cameras.fy)[:, 0].numpy() / 2
-    return Box(center, half_extent, float(np.median(depth.clip(min=1e-6) / focal)))
+    return Box(center, half_extent, float(np.median(depth.clip(min=1e-6 * half_extent) / focal)))
 
 
 def find_focus(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
