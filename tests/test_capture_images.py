@@ -121,10 +121,23 @@ def test_what_training_takes_is_known_of_views_that_were_read(tmp_path: Path, mo
 
     of_model = read(tmp_path, model_memory=of_pixels).subset([0, 2])
     assert of_model.memory == "images 0.1 MiB, tables 0.3 MiB, model up to 0.4 GiB; 3.0 GiB available"
-    assert read(tmp_path, downscale=2).memory == "images 0.0 MiB, tables 0.1 MiB; 3.0 GiB available"
+    of_sampler = read(tmp_path, downscale=2, model_memory=lambda *_: 0)
+    assert of_sampler.memory == "images 0.0 MiB, tables 0.1 MiB; 3.0 GiB available"
     for i, name in enumerate(NAMES):
         iio.imwrite(tmp_path / "images" / name, np.dstack((picture(i), picture(i)[..., 0])))
     assert "model up to 0.2 GiB" in read(tmp_path, model_memory=of_pixels).memory
+
+
+def test_images_that_nothing_is_trained_on_take_themselves_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_transforms(tmp_path)
+    size = 2 * WIDTH * HEIGHT * 3
+    monkeypatch.setattr(memory, "available_memory", lambda: size)
+    assert len(read(tmp_path, "test").names) == 2
+    monkeypatch.setattr(memory, "available_memory", lambda: size - 1)
+    with pytest.raises(InputError, match=r"transforms\.json: its 2 images take .*; .* train with a larger --downscale"):
+        read(tmp_path, "test")
 
 
 @pytest.mark.parametrize("size", ["paper", "small", "tiny"])

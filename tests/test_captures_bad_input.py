@@ -142,6 +142,18 @@ def test_cameras_too_far_from_the_origin_to_be_told_apart(tmp_path: Path) -> Non
     )
 
 
+def test_held_out_images_of_one_tripod_are_near_enough_to_the_origin(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path, PINHOLE)
+    names = [frame["file_path"] for frame in document["frames"]]
+    document |= {"train_filenames": names[2:], "test_filenames": names[:2]}
+    matrix = document["frames"][0]["transform_matrix"]
+    document["frames"][1]["transform_matrix"] = [[*row[:3], row[3] + 1e-5] for row in matrix[:3]] + [matrix[3]]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    held_out = read_split(tmp_path, "test")
+    assert held_out is not None
+    assert len(held_out.names) == 2
+
+
 def test_a_fisheye_has_no_tangential_terms(tmp_path: Path) -> None:
     document = write_transforms(tmp_path) | {"is_fisheye": True, "p2": 0.1}
     (tmp_path / "transforms.json").write_text(json.dumps(document))

@@ -20,10 +20,12 @@ from capture_folder import (
     picture,
     read,
     turned_jpeg,
+    write_blender,
     write_colmap,
     write_transforms,
 )
 
+from edge_se_sampler.data.dataset import read_split
 from edge_se_sampler.data.mask_files import find_mask, place_of_mask
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.errors import InputError
@@ -192,6 +194,29 @@ def test_masks_that_leave_no_object_are_an_error(tmp_path: Path) -> None:
         iio.imwrite(tmp_path / "masks" / name, 0 * half_mask())
     with pytest.raises(InputError, match=r"'images/view 01.png' and all other views are masked as a whole"):
         read(tmp_path, masks="object")
+
+
+@pytest.mark.parametrize("kind", ["transforms", "blender"])
+def test_held_out_views_that_are_masked_as_a_whole_do_not_stop_a_training(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of nothing that is known there is nothing to measure; of nothing but background there is."""
+    if kind == "transforms":
+        write_transforms(tmp_path)
+    else:
+        document = write_blender(tmp_path)
+        for split, frames in (("train", document["frames"][2:]), ("test", document["frames"][:2])):
+            (tmp_path / f"transforms_{split}.json").write_text(json.dumps(document | {"frames": frames}))
+    held_out = {Path(name) for name in read(tmp_path, "test").names}
+    for image in sorted((tmp_path.resolve() / "images").iterdir()):
+        mask = place_of_mask(tmp_path, image)
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        iio.imwrite(mask, 0 * half_mask() if image.relative_to(tmp_path.resolve()) in held_out else half_mask())
+    assert read(tmp_path).masks
+    capsys.readouterr()
+    assert read_split(tmp_path, "test") is None
+    assert "test views are masked as a whole, 2 of them: left out" in capsys.readouterr().err
+    assert not read(tmp_path, "test", masks="object").images[0][..., 3].any()
 
 
 def test_masks_as_objects_where_there_are_none(tmp_path: Path) -> None:

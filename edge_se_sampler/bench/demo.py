@@ -126,7 +126,7 @@ def _object_box(picture: Picture) -> tuple[slice, slice]:
 def _turntable(trainer: Trainer) -> Iterator[np.ndarray]:
     """Frames of a turn around the object, which fills them: of cameras that look straight at it."""
     config, size = trainer.config, 240
-    cameras = spiral(read_train_views(config), config.pipeline.model.depths, TURN)
+    cameras = spiral(read_train_views(config, trains=False), config.pipeline.model.depths, TURN)
     frame = 1 - 2 * max(SCENE["offset"])  # the part of the image that the object was given
     middle = {key: torch.full_like(cameras.cx, size / 2) for key in ("cx", "cy")}
     sides = {key: torch.full_like(cameras.width, size) for key in ("width", "height")}

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_se_sampler.data.capture import SPLITS, Split, keep_existing
-from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, load_views
+from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, check_scene, load_views
 from edge_se_sampler.data.scene_file import JsonValue, SourceFile, SourceLocation, check_folder, quote, read_json
 from edge_se_sampler.data.transforms_frames import read_entries, read_frames
 from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, NERF_SYNTHETIC_DISTANCES, Views
@@ -53,6 +53,8 @@ def read_blender(
     used: first of the folder, then of the json, then of the images."""
     frames, top = list_frames(Path(folder), split)
     depths = NERF_SYNTHETIC_DEPTHS if _is_of_nerf(top, frames) else None
+    if split == "train":
+        check_scene(frames)
     views = load_views(settings.choose(frames), settings, progress)
     return replace(views, depths=depths, data_format="blender")
 

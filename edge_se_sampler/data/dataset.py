@@ -13,7 +13,7 @@ from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Capture, Split
 from edge_se_sampler.data.colmap import read_colmap
 from edge_se_sampler.data.colmap_model import find_models
 from edge_se_sampler.data.config import DataFormat, Masks
-from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, load_views
+from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, check_scene, load_views
 from edge_se_sampler.data.llff import bounds_path, read_llff
 from edge_se_sampler.data.mask_files import describe_unused_masks
 from edge_se_sampler.data.memory import ModelMemory
@@ -41,8 +41,8 @@ class DataSettings:
     masks: Masks = "ignore"
     eval_every: int | None = None
     downscale: int = 1
-    model_memory: ModelMemory = lambda *_: 0
-    """What training takes of memory beside the images."""
+    model_memory: ModelMemory | None = None
+    """What training takes of memory beside the images; None: nothing is trained on them."""
     select: Select = lambda _: None
     """Which of a split's views are read."""
 
@@ -85,20 +85,23 @@ def read_split(
     settings: DataSettings = DataSettings(),
     progress: Progress = lambda done, total: None,
 ) -> Views | None:
-    """The views of one split of a folder; None where val or test have none. InputError for what cannot be used."""
+    """The views of one split of a folder; None where val or test have none, or none of which a pixel is known.
+    InputError for what cannot be used."""
     check_value("downscale", settings.downscale, settings.downscale >= 1, "at least 1")
     check_value(
         "eval-every", settings.eval_every, settings.eval_every is None or settings.eval_every >= 2, "at least 2"
     )
     data_format = find_format(folder, settings.data_format)
-    load = LoadSettings(settings.masks, settings.downscale, settings.model_memory, settings.select)
+    load = LoadSettings(
+        settings.masks, settings.downscale, settings.model_memory, settings.select, held_out=split != "train"
+    )
     if data_format == "blender":
         _check_unsplit(settings, has_own_split=True)
         if split != "train" and not has_views(folder, split):
             if has_split(folder, split):
                 print(f"{transforms_path(folder, split)}: none of its images exists: left out", file=sys.stderr)
             return None
-        return read_blender(folder, split, load, progress)
+        return _leave_out_unknown(read_blender(folder, split, load, progress), folder, split)
     capture, rows, eval_every = _read_capture(folder, split, settings, data_format)
     if split == "train" and not rows:
         problem, hint = "has no images to train on", "add some, or correct its lists"
@@ -107,10 +110,21 @@ def read_split(
         raise SourceLocation(folder).error(problem, hint)
     if not rows:
         return None
+    if split == "train":
+        check_scene([capture.frames[i] for i in rows])
     rows = load.choose(rows)
     views = load_views([capture.frames[i] for i in rows], load, progress)
     points = None if capture.points is None else tuple(capture.points[i] for i in rows)
-    return replace(views, points=points, depths=None, data_format=data_format, eval_every=eval_every)
+    views = replace(views, points=points, depths=None, data_format=data_format, eval_every=eval_every)
+    return _leave_out_unknown(views, folder, split)
+
+
+def _leave_out_unknown(views: Views, folder: Path, split: Split) -> Views | None:
+    """The views, or None and a line if masks leave nothing of all of them."""
+    if views.masks is None or any(mask.any() for mask in views.masks):
+        return views
+    print(f"{folder}: the {split} views are masked as a whole, {len(views.names)} of them: left out", file=sys.stderr)
+    return None
 
 
 def list_frames(folder: Path, split: Split, settings: DataSettings = DataSettings()) -> list[Frame]:

@@ -71,10 +71,12 @@ class LoadSettings:
     """What a mask file means: pixels outside are unknown and ignored, or not of the object, which is alpha."""
     downscale: int = 1
     """Every so many pixels along both axes become one."""
-    model_memory: ModelMemory = lambda *_: 0
-    """What training takes of memory beside them."""
+    model_memory: ModelMemory | None = None
+    """What training takes of memory beside them; None: nothing is trained on them."""
     select: Select = lambda _: None
     """Which of a split's views are read."""
+    held_out: bool = False
+    """Whether renderings are to be compared with them: masks may then leave nothing of all."""
 
     def choose(self, views: Sequence[T]) -> Sequence[T]:
         """The views that are read, of all of a split."""
@@ -106,7 +108,7 @@ def choose_orientation(
 
 
 def check_cameras(frames: Sequence[Frame]) -> None:
-    """InputError for cameras that cannot have taken the images of at least one frame, or too far from the origin."""
+    """InputError for cameras that cannot have taken the images of the frames."""
     for frame in frames:
         width, height, camera = frame.header.width, frame.header.height, frame.camera
         longest = max(width, height)
@@ -121,6 +123,12 @@ def check_cameras(frames: Sequence[Frame]) -> None:
         if not np.abs(frame.pose[:, 3]).max() <= MAX_POSITION:
             problem = f"has its camera at {', '.join(f'{x:g}' for x in frame.pose[:, 3])}"
             raise frame.image.error(problem, f"write coordinates of at most {MAX_POSITION:g}")
+
+
+def check_scene(frames: Sequence[Frame]) -> None:
+    """As `check_cameras`, of all of a scene's training images, at least one; InputError, too, if they are too far from
+    the origin."""
+    check_cameras(frames)
     positions = np.array([frame.pose[:, 3] for frame in frames])
     center = np.median(positions, axis=0)
     spread, removal = np.linalg.norm(positions - center, axis=1).max(), np.linalg.norm(center)
@@ -135,14 +143,14 @@ def load_views(
     settings: LoadSettings = LoadSettings(),
     progress: Progress = lambda done, total: None,
 ) -> Views:
-    """Decode the images of at least one frame. InputError for images and masks that cannot be used, for a mask of
-    another size, and where they would not fit the machine's memory."""
+    """Decode the images of at least one frame. InputError for images, masks and cameras that cannot be used, for a mask
+    of another size, where they would not fit the machine's memory, and for masks that leave nothing to train on."""
     listing = SourceLocation(frames[0].image.location.file)
     check_cameras(frames)
     for frame in frames:
         _check_size(frame, settings.downscale)
     has_alpha = settings.masks == "object" or all(frame.header.channels == 4 for frame in frames)
-    of_model = partial(settings.model_memory, has_alpha)
+    of_model = None if settings.model_memory is None else partial(settings.model_memory, has_alpha)
     memory = check_memory(_sizes(frames), settings.downscale, of_model, listing)
     largest = max(frame.header.width * frame.header.height for frame in frames)
     images, masks = [], []
@@ -157,11 +165,11 @@ def load_views(
         problem = f"{those} have neither masks nor alpha for --masks object"
         raise listing.error(problem, "add masks (masks/1.jpg.png for images/1.jpg), or leave the flag out")
     if settings.masks == "object":
-        _check_objects(frames, images)
+        _check_objects(frames, images, settings.held_out)
     has_masks = any(mask is not None for mask in masks)
     if has_masks:
         masks = [np.ones(i.shape[:2], dtype=bool) if m is None else m for i, m in zip(images, masks, strict=True)]
-        if not any(mask.any() for mask in masks):
+        if not (settings.held_out or any(mask.any() for mask in masks)):
             location = frames[0].image.location
             frames_field = replace(location, field=location.field.partition("[")[0])
             raise frames_field.error("all pixels of all views are masked", "masks are non-zero where to train")
@@ -170,9 +178,9 @@ def load_views(
     return Views(names, tuple(images), tuple(masks) if has_masks else None, cameras, memory=memory)
 
 
-def _check_objects(frames: Sequence[Frame], images: Sequence[np.ndarray]) -> None:
-    """InputError if masks leave no object in any view; says so if views have neither mask nor alpha."""
-    if not any(image.shape[2] == 3 or image[..., 3].any() for image in images):
+def _check_objects(frames: Sequence[Frame], images: Sequence[np.ndarray], held_out: bool) -> None:
+    """InputError if masks leave no object in any view to train on; says so if views have neither mask nor alpha."""
+    if not held_out and not any(image.shape[2] == 3 or image[..., 3].any() for image in images):
         raise frames[0].image.error("and all other views are masked as a whole", "masks are non-zero on the object")
     whole = [frame for frame, image in zip(frames, images, strict=True) if image.shape[2] == 3]
     if whole:

@@ -1,5 +1,5 @@
-"""Whether the images of a scene, what training keeps of their pixels, and its model fit the machine's memory: estimated
-before any image is decoded."""
+"""Whether the images of a scene fit the machine's memory and, where they are trained on, what training keeps of their
+pixels and its model: estimated before any image is decoded."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ takes beside them."""
 
 @dataclass(frozen=True)
 class MemoryNeeds:
-    """Bytes that training takes at most."""
+    """Bytes that are taken at most."""
 
     images: int
     tables: int
-    """What pixel samplers keep of each pixel."""
+    """What pixel samplers keep of each pixel; 0: there are none."""
     model: int
     """0: it is in a memory of its own, or there is none."""
 
@@ -44,7 +44,7 @@ class MemoryNeeds:
         return self.images + self.tables + self.model
 
     def __str__(self) -> str:
-        parts = [f"images {_format(self.images)}", f"tables {_format(self.tables)}"]
+        parts = [f"images {_format(self.images)}"] + [f"tables {_format(self.tables)}"] * (self.tables > 0)
         return ", ".join(parts + [f"model up to {_format(self.model)}"] * (self.model > 0))
 
 
@@ -87,27 +87,34 @@ def _physical_memory() -> int | None:
 
 
 def check_memory(
-    sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int], location: SourceLocation
+    sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int] | None, location: SourceLocation
 ) -> str:
-    """What training on images of these sizes takes, and what is available, in a line; InputError, which says what to
-    give, if that is less. `sizes` (n, 3) int64: width, height, bytes of a pixel; `model_memory` is the model's by the
-    longest side; `location` is the file that lists them."""
+    """What images of these sizes take, and what is available, in a line; InputError, which says what to give, if that
+    is less. `sizes` (n, 3) int64: width, height, bytes of a pixel; `model_memory` is that of the model that is trained
+    on them, by the longest side, None: nothing is; `location` is the file that lists them."""
     needed, available = estimate_memory(sizes, downscale, model_memory), available_memory()
     if available is None:
         return str(needed)
     if needed.total <= available:
         return f"{needed}; {_format(available)} available"
-    problem = f"training on its {len(sizes)} images takes {_format(needed.total)} of memory ({needed})"
-    remedy = _find_remedy(sizes, downscale, model_memory, available)
-    raise location.error(f"{problem}, {_format(available)} are available", remedy)
+    if model_memory is None:
+        problem, remedy = f"its {len(sizes)} images take", "end other programs, or train with a larger --downscale"
+    else:
+        problem = f"training on its {len(sizes)} images takes"
+        remedy = _find_remedy(sizes, downscale, model_memory, available)
+    problem = f"{problem} {_format(needed.total)} of memory ({needed}), {_format(available)} are available"
+    raise location.error(problem, remedy)
 
 
-def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int]) -> MemoryNeeds:
-    """What training on images of these sizes takes, as `check_memory` has them."""
+def estimate_memory(sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int] | None) -> MemoryNeeds:
+    """What images of these sizes take, as `check_memory` has them."""
     width, height = sizes[:, 0] // downscale, sizes[:, 1] // downscale
     pixels = width * height
-    images, tables = COPIES * int((pixels * sizes[:, 2]).sum()), BYTES_OF_TABLES * int(pixels.sum())
-    return MemoryNeeds(images, tables, model_memory(int(max(width.max(), height.max()))))
+    images = int((pixels * sizes[:, 2]).sum())
+    if model_memory is None:
+        return MemoryNeeds(images, 0, 0)
+    longest = int(max(width.max(), height.max()))
+    return MemoryNeeds(COPIES * images, BYTES_OF_TABLES * int(pixels.sum()), model_memory(longest))
 
 
 def _find_remedy(sizes: np.ndarray, downscale: int, model_memory: Callable[[int], int], available: int) -> str:

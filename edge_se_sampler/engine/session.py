@@ -189,11 +189,13 @@ def _read_preview(config: TrainerConfig) -> Picture | None:
     return None if views is None else to_pictures(views)[0]
 
 
-def read_train_views(config: TrainerConfig) -> Views:
-    """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data."""
+def read_train_views(config: TrainerConfig, trains: bool = True) -> Views:
+    """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data, and
+    where memory is too little for them and, if something trains on them, for what that takes."""
     if config.data is None:
         raise InputError("--data is missing: the folder to train on (edge-se scenes makes some)")
-    views = _read_split(config, "train", partial(_training_memory, config), partial(select_views, config))
+    memory = partial(_training_memory, config) if trains else None
+    views = _read_split(config, "train", memory, partial(select_views, config))
     assert views is not None
     return views
 
@@ -206,7 +208,7 @@ def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> in
 
 
 def _read_split(
-    config: TrainerConfig, split: Split, model_memory: ModelMemory = lambda *_: 0, select: Select = lambda _: None
+    config: TrainerConfig, split: Split, model_memory: ModelMemory | None = None, select: Select = lambda _: None
 ) -> Views | None:
     assert config.data is not None
     settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory, select)

@@ -75,7 +75,7 @@ def find_cameras(config: TrainerConfig, kind: str, num_frames: int) -> Cameras:
     views in their order ("interpolate"), or a turn around what they look at ("spiral")."""
     if kind == "test":
         return read_test_views(config).cameras
-    views = read_train_views(config)
+    views = read_train_views(config, trains=False)
     if kind == "train":
         return views.cameras
     trajectory = spiral if kind == "spiral" else through

@@ -82,7 +82,8 @@ def export_mesh(
 def analyze_box(config: TrainerConfig) -> BrickGrid:
     """The cells that may hold something by a run's training views: a dense network without cells may have learned
     anything that looks like the background outside of silhouettes."""
-    return analyze_views(read_train_views(config), replace(config.pipeline.model, empty_space_skipping=True)).grid()
+    views = read_train_views(config, trains=False)
+    return analyze_views(views, replace(config.pipeline.model, empty_space_skipping=True)).grid()
 
 
 def render_colors(model: RayModel, positions: np.ndarray, normals: np.ndarray, before: float) -> np.ndarray:

@@ -57,7 +57,7 @@ def load_points(run: RunFolder, config: TrainerConfig, path: Path, num_points: i
     check_value("seed", seed, seed >= 0, "at least 0")
     check_export(path, ".ply")
     model, _ = load_model(run, config)
-    return find_points(model, read_train_views(config), num_points, np.random.default_rng(seed))
+    return find_points(model, read_train_views(config, trains=False), num_points, np.random.default_rng(seed))
 
 
 def find_points(model: RayModel, views: Views, num_points: int, rng: np.random.Generator) -> PointCloud:

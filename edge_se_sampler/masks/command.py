@@ -15,7 +15,7 @@ import numpy as np
 
 from edge_se_sampler.data.capture import SPLITS
 from edge_se_sampler.data.dataset import DataSettings, list_frames
-from edge_se_sampler.data.frames import Frame, check_cameras
+from edge_se_sampler.data.frames import Frame, check_scene
 from edge_se_sampler.data.image_file import read_image, turn_upright
 from edge_se_sampler.data.lens import Intrinsics
 from edge_se_sampler.data.mask_files import place_of_mask
@@ -85,7 +85,7 @@ def _frames(folder: Path, settings: DataSettings) -> list[Frame]:
     if len(frames) < MIN_VIEWS:
         problem = f"has {len(frames)} images, of which masks cannot be refined across views"
         raise SourceLocation(folder).error(problem, f"give at least {MIN_VIEWS}")
-    check_cameras(frames)
+    check_scene(frames)
     for frame in frames:
         if frame.mask is not None:
             raise frame.image.error(f"has a mask already: {frame.mask.path}", "use it, or remove all masks")

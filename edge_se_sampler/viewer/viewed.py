@@ -73,7 +73,7 @@ class Viewed:
         """A run at its last checkpoint; nothing is written. InputError for a bad run or data."""
         newest = latest_checkpoint(run.checkpoints)
         _, state = load_state(run, config)
-        device, views = choose_device(config.machine.device_type, of_run=True), read_train_views(config)
+        device, views = choose_device(config.machine.device_type, of_run=True), read_train_views(config, trains=False)
         pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
         load_weights(pipeline.model, state["model"])
         viewed = cls(config.setup(run=run, pipeline=pipeline, preview=None))
