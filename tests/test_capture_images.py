@@ -79,6 +79,13 @@ def test_headers_of_pngs_are_read_without_their_pixels(tmp_path: Path) -> None:
     assert read_header(file) == ImageHeader(WIDTH, HEIGHT, 3, 1)
 
 
+def test_an_image_of_more_pixels_than_pillow_opens_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path)
+    monkeypatch.setattr("PIL.Image.MAX_IMAGE_PIXELS", WIDTH * HEIGHT // 2 - 1)
+    with pytest.raises(InputError, match=r"has more than [\d,]+ pixels; make it smaller"):
+        read(tmp_path)
+
+
 def test_orientations_that_the_camera_ignored(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     for i, name in enumerate(NAMES):

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 import torch
@@ -217,3 +218,18 @@ def test_write_atomically_replaces_the_whole_file(tmp_path: Path):
     write_atomically(path, b"new")
     assert path.read_bytes() == b"new"
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_a_file_that_another_process_has_begun_to_write_is_left_to_it(tmp_path: Path):
+    path, temporary = tmp_path / "turn.gif", tmp_path / ".turn.gif.tmp"
+    write_atomically(path, b"old")
+
+    def overtaken(file: BinaryIO) -> None:
+        file.write(b"the first one's")
+        temporary.unlink()
+        temporary.write_bytes(b"half of the second o")
+
+    with pytest.raises(InputError, match=r"untouched \(another process writes it, too\)"):
+        write_atomically(path, overtaken)
+    assert path.read_bytes() == b"old"
+    assert temporary.read_bytes() == b"half of the second o"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import threading
 from dataclasses import replace
@@ -16,6 +17,7 @@ import torch
 from lean_models import VIEWS, config_of
 from tiny import tiny_trainer
 
+from edge_se_sampler.data.camera_path import read_camera_path
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import SAMPLER, override
 from edge_se_sampler.engine.rendering import render_outputs
@@ -180,6 +182,15 @@ def test_one_keyframe_is_a_path_that_stands_still() -> None:
     cameras = read_path(camera_path([keyframe(0.3)], seconds=1.0, height=64))
     assert len(cameras) == FPS
     np.testing.assert_allclose(cameras.camera_to_worlds.numpy(), np.stack([keyframe(0.3).pose] * FPS), atol=1e-9)
+
+
+@pytest.mark.parametrize(("aspect", "expected"), [(2.2, (8191, 3723)), (0.4, (3277, 8192)), (1e5, (8192, 1))])
+def test_a_camera_path_is_no_larger_than_render_takes(aspect: float, expected: tuple[int, int], tmp_path: Path) -> None:
+    """Of a browser's window of any shape, for photographs of 9,000 pixels through the longest lens."""
+    view = View(keyframe(0.3).pose, math.radians(0.006), aspect)
+    (tmp_path / "path.json").write_text(json.dumps(camera_path([view], seconds=1.0, height=9000)))
+    cameras = read_camera_path(tmp_path / "path.json").cameras
+    assert (int(cameras.width[0]), int(cameras.height[0])) == expected
 
 
 def test_the_drawn_cells_are_the_occupied_ones_and_the_hull(viewed: Viewed) -> None:

@@ -17,7 +17,7 @@ from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.data.transforms_frames import rigid_pose
 
 MAX_SIDE = 8192  # pixels
-FIELDS_OF_VIEW = 0.1, 179.0  # degrees
+FIELDS_OF_VIEW = 0.001, 179.0  # degrees
 OLD_COLMAP_TRANSFORM = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))
 """The applied_transform that nerfstudio assumes of COLMAP's scenes whose json has none."""
 

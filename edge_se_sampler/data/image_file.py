@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zlib
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +20,7 @@ _PNG_EXIF = b"eXIf", b"Raw profile type", b"com.adobe.xmp"
 """In a PNG that may have an orientation."""
 _ORIENTATION = 274
 """EXIF's tag."""
+warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # of half as many pixels as are refused
 _COPY_AGAIN = "copy or download it again"
 
 # pillow's mode of the file -> the mode to read it in; others (CMYK, 32 bits, float) have no plain 8-bit meaning
@@ -55,6 +57,8 @@ def read_header(file: SourceFile) -> ImageHeader:
             may_be_turned = image.format != "PNG" or _may_have_exif(file.path.read_bytes())
             orientation = image.getexif().get(_ORIENTATION, 1) if may_be_turned else 1
             is_lossy = image.format != "PNG"
+    except Image.DecompressionBombError:
+        raise file.error(f"has more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels", "make it smaller") from None
     except Exception:  # decoding says what is wrong
         height, width, channels = read_image(file).shape
         return ImageHeader(width, height, channels)

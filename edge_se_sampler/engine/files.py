@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -16,20 +17,28 @@ from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 
 
 def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) -> None:
-    """Replace a file's content, by bytes or by what writes it, and flush it to the disk; on failure leave the file as
-    it was."""
-    temporary = path.parent / f".{path.name}.tmp"
+    """Replace a file's content, by bytes or by what writes it, and flush it to the disk; on failure, and where another
+    process has begun to write it meanwhile, leave the file as it was."""
+    temporary, own = path.parent / f".{path.name}.tmp", None
+
+    def is_own() -> bool:
+        return own is not None and os.path.lexists(temporary) and os.path.samestat(own, os.lstat(temporary))
+
     with os_errors_as_input_errors(f"{path}: cannot be written, what was there before is untouched"):
         try:
             temporary.unlink(missing_ok=True)  # it may be a link that leads elsewhere
             with open(temporary, "xb") as file:
+                own = os.fstat(file.fileno())
                 file.write(content) if isinstance(content, bytes) else content(file)
                 file.flush()
                 os.fsync(file.fileno())
+                if not is_own():
+                    raise FileExistsError(errno.EEXIST, "another process writes it, too")
             os.replace(temporary, path)
         finally:
             with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
+                if is_own():
+                    temporary.unlink()
         with contextlib.suppress(PermissionError):  # a folder that cannot be opened cannot be flushed
             folder = os.open(path.parent, os.O_RDONLY)
             try:

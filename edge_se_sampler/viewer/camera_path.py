@@ -11,6 +11,7 @@ import torch
 import viser
 import viser.transforms as tf
 
+from edge_se_sampler.data.camera_path import MAX_SIDE
 from edge_se_sampler.data.cameras import Cameras, rotation_power
 from edge_se_sampler.engine.trajectories import catmull_rom
 
@@ -63,7 +64,8 @@ class View:
 
 def camera_path(keyframes: list[View], seconds: float, height: int) -> dict[str, Any]:
     """The content of a camera_path.json, as nerfstudio's viewer writes it (1.1.5), in the data's world units, through
-    keyframes: positions on a Catmull-Rom spline, rotations at an even rate between two, the first one's aspect."""
+    keyframes: positions on a Catmull-Rom spline, rotations at an even rate between two, the first one's aspect, and at
+    most MAX_SIDE pixels wide and high."""
     rotations = torch.from_numpy(np.stack([view.pose[:, :3] for view in keyframes]))
     values = np.stack([np.append(view.pose[:, 3], view.fov) for view in keyframes])
     last, aspect, frames = len(keyframes) - 1, keyframes[0].aspect, []
@@ -75,5 +77,6 @@ def camera_path(keyframes: list[View], seconds: float, height: int) -> dict[str,
         matrix[:3] = np.column_stack(((rotations[k] @ turned).numpy(), (x, y, z)))
         frame = {"camera_to_world": matrix.ravel().tolist(), "fov": math.degrees(fov), "aspect": aspect}
         frames.append(frame)
-    size = {"render_height": height, "render_width": max(1, round(height * aspect))}
+    height = max(1, min(height, MAX_SIDE, int(MAX_SIDE / aspect)))
+    size = {"render_height": height, "render_width": min(MAX_SIDE, max(1, round(height * aspect)))}
     return {"camera_type": "perspective", **size, "fps": FPS, "seconds": seconds, "camera_path": frames}
