@@ -8,13 +8,14 @@ from itertools import chain
 from typing import Any
 
 from edge_se_sampler.bench.chart.summary import mean_psnr_at
-from edge_se_sampler.bench.real.published import PIXELS, PUBLISHED
+from edge_se_sampler.bench.real.published import PUBLISHED
 from edge_se_sampler.bench.real.summary import (
     BASELINE,
     UNIFORM,
     WITHOUT_MASKS,
     Trainings,
     by_program,
+    is_published,
     label_of,
     name_of,
     panel_of,
@@ -29,6 +30,20 @@ TICKS = {10: "10 s", 60: "1 min", 180: "3 min", 600: "10 min", 3600: "1 h", 8640
 MARKS = "s^Dv*P"
 LINES = {BASELINE: ("-", "black"), UNIFORM: ("-.", "C5"), WITHOUT_MASKS: ("--", "black")}
 """Style and color, by variant."""
+
+
+def describe_lines(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> str:
+    """What a picture of trainings with time budgets shows, in words."""
+    variants = {run["variant"] for run in runs}
+    parts = {
+        "lean-nerf (black)": BASELINE in variants,
+        "without the masks' hull (dashed)": WITHOUT_MASKS in variants,
+        "with uniform pixels (brown)": UNIFORM in variants,
+        "other programs (dotted)": bool(baselines),
+        "published results, on GPUs (gray marks)": any(map(is_published, panels_of(runs))),
+    }
+    shown = ", ".join(part for part, is_there in parts.items() if is_there)
+    return f"Test PSNR in dB over training time: {shown}; bands: from the least to the greatest of the seeds"
 
 
 def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> Any:
@@ -48,7 +63,7 @@ def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> A
         for name, trainings in beside[panel].items():
             for found in trainings:
                 _draw_curve(axis, found, label=name, color=colors[name])
-        if panel[1] == (PIXELS, PIXELS):
+        if is_published(panel):
             _draw_published(axis, panel[0])
         axis.set_title(label_of(panel), fontsize=10)
         axis.set_xscale("log")
@@ -65,8 +80,7 @@ def draw_chart(runs: list[Run], baselines: Mapping[str, Mapping[str, Any]]) -> A
     figure.legend(
         handles.values(), handles, loc="outside lower center", ncols=2, handlelength=3, fontsize=8, frameon=False
     )
-    title = "test PSNR [dB] over training time; bands: least to greatest of the seeds; gray: published, on GPUs"
-    figure.suptitle(title, fontsize=9)
+    figure.suptitle("test PSNR [dB] over training time; bands: least to greatest of the seeds", fontsize=9)
     return figure
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_se_sampler.bench.baselines.run import read_baselines
-from edge_se_sampler.bench.real.figures import LINES, draw_chart
+from edge_se_sampler.bench.real.figures import LINES, describe_lines, draw_chart
 from edge_se_sampler.bench.real.published import PUBLISHED
 from edge_se_sampler.bench.real.summary import (
     BASELINE,
@@ -17,6 +17,7 @@ from edge_se_sampler.bench.real.summary import (
     WITHOUT_MASKS,
     best_psnr_at,
     by_program,
+    is_published,
     label_of,
     length_of,
     name_of,
@@ -26,6 +27,7 @@ from edge_se_sampler.bench.real.summary import (
     seconds_of,
     timed,
 )
+from edge_se_sampler.bench.real.trials import VARIANTS
 from edge_se_sampler.bench.report import (
     decimals,
     describe_command,
@@ -43,6 +45,14 @@ TABULATED = BASELINE, UNIFORM
 """Variants with rows of their own; others are looked at where one thing is changed."""
 Baselines = Mapping[str, Mapping[str, Any]]
 """Results of other programs."""
+ORIGINS = {
+    "of NeRF-synthetic, Mildenhall et al. 2020, in its official splits, premultiplied colors averaged to the size, in "
+    "front of white": ("chair", "lego"),
+    "photographed, with masks, split as their folders are": ("dtu_scan24", "ethiopianHead"),
+    "photographed, without masks: lenses undone, colors averaged to the size, and every eighth image, in the order of "
+    "their names, held out": ("colmap_mug", "fox"),
+}
+"""What is said of scenes -> their names."""
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
@@ -55,17 +65,20 @@ def draw(folder: Path, workplace: Path | None) -> None:
 def describe(folder: Path) -> str:
     """The README.md of a folder with a result.json."""
     result, baselines = _read(folder)
-    runs = _tabulated(result["runs"])
+    runs, changes = _tabulated(result["runs"]), _table_of_variants(result["runs"])
     return fill_template(
         __file__,
         folder,
         title=read_title(folder, "lean-nerf on real scenes"),
+        scenes=_describe_scenes(result["runs"]),
+        caption=describe_lines(timed(result["runs"]), baselines),
         psnr=_table_of_psnr(runs),
         baselines=_table_of_baselines(timed(result["runs"]), baselines),
-        published=_table_of_published(),
+        published=_table_of_published() if any(map(is_published, panels_of(runs))) else "",
         gaps=_table_of(runs, {"test": "psnr", "SSIM": "ssim", "validation": "val_psnr", "training": "train_psnr"}),
         costs=_table_of_costs(runs),
-        variants=_table_of_variants(result["runs"]),
+        variants=changes,
+        flags=_list_flags(result["runs"]) if changes else "",
         notes=read_notes(folder),
         reproduce=describe_command(*baselines.values(), result),
     )
@@ -86,6 +99,24 @@ def _read(folder: Path) -> tuple[dict[str, Any], Baselines]:
 def _tabulated(runs: list[Run]) -> list[Run]:
     """Those with a time budget that have rows of their own."""
     return [run for run in timed(runs) if run["variant"] in TABULATED]
+
+
+def _describe_scenes(runs: list[Run]) -> str:
+    """The scenes by where they are from; those that are from elsewhere by their names alone."""
+    scenes = {run["scene"] for run in runs}
+    known = {origin: sorted(scenes.intersection(names)) for origin, names in ORIGINS.items()}
+    parts = [f"{' and '.join(names)} ({origin})" for origin, names in known.items() if names]
+    return "; ".join([*parts, *sorted(scenes.difference(*known.values()))])
+
+
+def _list_flags(runs: list[Run]) -> str:
+    """What was changed as flags, a line a variant; empty where nothing was."""
+    lines = []
+    for variant in sorted({run["variant"] for run in runs}):
+        changes = VARIANTS.get(variant, {})
+        flags = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in changes.items())
+        lines += [f"- *{variant}*: `{flags}`"] * bool(flags)
+    return "\n".join(lines)
 
 
 def _by_key(runs: list[Run]) -> dict[Key, list[Run]]:

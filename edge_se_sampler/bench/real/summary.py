@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from edge_se_sampler.bench.real.published import PIXELS
+from edge_se_sampler.bench.real.published import PIXELS, PUBLISHED
 from edge_se_sampler.bench.results import Run
 
 BASELINE, UNIFORM, WITHOUT_MASKS = "lean-nerf", "uniform pixels", "no hull"
@@ -28,6 +28,12 @@ def panels_of(runs: list[Run]) -> list[Panel]:
     """NeRF's scenes first, small before large."""
     order = {panel_of(run): (run.get("val_psnr") is None, -run["downscale"], run["scene"]) for run in runs}
     return sorted(order, key=lambda panel: order[panel])
+
+
+def is_published(panel: Panel) -> bool:
+    """Whether others have published results of a scene at that size."""
+    scene, size = panel
+    return size == (PIXELS, PIXELS) and any(scene in published.psnr for published in PUBLISHED)
 
 
 def label_of(panel: Panel) -> str:

@@ -23,6 +23,7 @@ from edge_se_sampler.bench.strategies.summary import (
     Panel,
     Verdict,
     best_at_equal_seconds,
+    captures_of,
     compare,
     cost_of_a_step,
     count_failures,
@@ -59,7 +60,7 @@ def describe(folder: Path) -> str:
         nerf=settings["nerf"],
         lean=settings["lean"],
         failure_rule=FAILURE_RULE,
-        scenes=", ".join(sorted({run["scene"] for run in runs})),
+        scenes=_list_scenes(runs),
         claims=table_of_claims(runs),
         best=_table_of_best(runs),
         panels="\n\n".join(f"### {label}\n\n{_table_of(runs, panel)}" for panel, label in labels_of(runs).items()),
@@ -75,13 +76,21 @@ def tables(folder: Path) -> dict[str, str]:
 
 
 def labels_of(runs: list[Run]) -> dict[Panel, str]:
-    """Panel -> its model, the size of its images, and whether they are centered."""
+    """Panel -> its model, its captures, if it is of such, the size of its images, and whether they are centered."""
     labels = {}
     for panel in panels_of(runs):
         width, height = panel.size
         size = f"{width} px" if width == height else f"{width} x {height} px"
-        labels[panel] = f"{panel.model}, {size}" + (", off center" if panel.placement == "shifted" else "")
+        parts = [panel.model, *captures_of(run for run in runs if Panel.of(run) == panel), size]
+        labels[panel] = ", ".join(parts + ["off center"] * (panel.placement == "shifted"))
     return labels
+
+
+def _list_scenes(runs: list[Run]) -> str:
+    captures = captures_of(runs)
+    objects = sorted({run["scene"] for run in runs}.difference(captures))
+    parts = [" and ".join(objects)] * bool(objects) + [f"captures: {' and '.join(captures)}"] * bool(captures)
+    return "; ".join(parts)
 
 
 def table_of_claims(runs: list[Run]) -> str:

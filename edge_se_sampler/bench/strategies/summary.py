@@ -71,6 +71,11 @@ def panels_of(runs: Iterable[Run]) -> list[Panel]:
     return sorted({Panel.of(run) for run in runs}, key=order)
 
 
+def captures_of(runs: Iterable[Run]) -> list[str]:
+    """The scenes in which no alpha tells an object, by name."""
+    return sorted({run["scene"] for run in runs if run["foreground_psnr"] is None})
+
+
 def strategies_of(runs: Iterable[Run]) -> list[str]:
     """In the order of `STRATEGIES`, then those that this installation lacks."""
     found = {run["strategy"] for run in runs}
