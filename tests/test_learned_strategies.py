@@ -484,6 +484,41 @@ def test_it_explores_cells_without_an_estimate_first() -> None:
     assert (strategy.s[strategy.cells.counts > 0] > 0).all()
 
 
+@pytest.mark.parametrize("images_per_step", ["one", "all"])
+def test_exploration_ends_when_a_step_reaches_much_less_than_the_best(
+    images_per_step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of each image by itself where a step draws from one: others that were not looked at are still to be explored."""
+    yields, pass_on = [], actray.ActRay._pass_on
+    monkeypatch.setattr(actray.ActRay, "_pass_on", lambda *given: yields.append(pass_on(*given)) or yields[-1])
+    numbers = list(range(8))
+    host = batch_of([(40, 30)] * 8, numbers)
+    sampler = following(LATE, early="uniform", late="actray", images_per_step=images_per_step, rays=300)
+    strategy: Any = sampler.strategies["actray"].distribution
+    groups = numbers if images_per_step == "one" else [0]
+    best, exploring, unvisited = dict.fromkeys(groups, 0.0), dict.fromkeys(groups, True), 0
+    for step in range(40):
+        _, pixels = trained("actray", 1, host, sampler)
+        group = int(pixels["indices"][0, 0]) if images_per_step == "one" else 0
+        best[group] = max(best[group], yields[-1] / 300)
+        exploring[group] &= yields[-1] / 300 * 3.5 >= best[group]
+        if step % 2:
+            unknown = ((strategy.s == 0) & (strategy.cells.counts > 0)).reshape(len(groups), -1).any(axis=1)
+            exploring = {g: exploring[g] and unknown[i] for i, g in enumerate(groups)}
+        assert strategy.exploring.tolist() == [*exploring.values()]
+        np.testing.assert_allclose(strategy.best_yield, [*best.values()])
+        unvisited += any(not on for on in exploring.values()) and min(best.values()) == 0
+    assert not any(exploring.values())
+    assert (unvisited > 0) == (images_per_step == "one")
+
+
+def test_what_an_earlier_version_knew_of_its_exploration_holds_for_all_images() -> None:
+    sampler, _ = trained("actray", 4, batch_of(), images_per_step="one")
+    strategy: Any = sampler.strategies["actray"].distribution
+    strategy.load_state_dict(strategy.state_dict() | {"exploring": False, "best_yield": 2.5})
+    assert (strategy.exploring.tolist(), strategy.best_yield.tolist()) == ([False] * 3, [2.5] * 3)
+
+
 # ---- settings
 
 

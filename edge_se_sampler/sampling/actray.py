@@ -10,7 +10,8 @@ t    steps since a pixel of the cell was drawn
 An error E found at a pixel is passed on to others: l <- (l s + E s'^2) / (s + s'), s <- (s^2 + s'^2) / (s + s'), with
 their similarity s'. Pixels are drawn in proportion to the upper confidence bound u exp(k min(t, median t)), with
 exp(k median t) = max u / (2 median u). Before, it explores: only cells without an estimate are drawn, until a step's
-errors reach 3.5 times fewer new cells a pixel than in the best step; those left get the mean.
+errors reach 3.5 times fewer new cells a pixel than in the best step; those left get the mean. Where a step draws from one
+image, each image is explored by itself.
 
 Decided here, for a sampler sees errors and no geometry: errors are passed on to the eight neighboring cells, 64 x 64 an
 image, in place of the pixels of other images that show the same point; a cell has its central pixel's color. k is at
@@ -50,7 +51,8 @@ class ActRay(LearnedDistribution):
         self.l, self.s = np.zeros(0), np.zeros(0)  # by cell; s is 0 without an estimate
         self.drawn_at = np.zeros(0)  # the clock then
         self.colors = np.zeros((0, 3), dtype=np.float32)
-        self.clock, self.exploring, self.best_yield = 0, True, 0.0
+        self.clock = 0
+        self.exploring, self.best_yield = np.ones(self._num_groups, dtype=bool), np.zeros(self._num_groups)  # by group
         self._colored: set[int] = set()  # images
 
     def tables(self, batch: ImageBatch) -> tuple[CellTable, Tensor]:
@@ -58,6 +60,9 @@ class ActRay(LearnedDistribution):
         cells, index = super().tables(batch)
         if grown := len(cells.values) - len(self.l):
             self.l, self.s, self.drawn_at = (np.append(a, np.zeros(grown)) for a in (self.l, self.s, self.drawn_at))
+        if grown := self._num_groups - len(self.exploring):
+            self.exploring = np.append(self.exploring, np.ones(grown, dtype=bool))
+            self.best_yield = np.append(self.best_yield, np.zeros(grown))
         if grown := len(cells.values) - len(self.colors):
             self.colors = np.concatenate((self.colors, np.zeros((grown, 3), dtype=np.float32)))
         for k, image in enumerate(index.tolist()):
@@ -67,6 +72,14 @@ class ActRay(LearnedDistribution):
                 colors = composite(batch.image(k)[np.ix_(*centers)], batch.background_color)
                 self.colors[cells.first[image] :][: colors[..., 0].size] = colors.reshape(-1, 3)
         return cells, index
+
+    @property
+    def _num_groups(self) -> int:
+        """Of images that are explored together."""
+        return 1 if self.cells.across_images else len(self.cells)
+
+    def _group_of(self, images: np.ndarray) -> np.ndarray:
+        return np.zeros_like(images) if self.cells.across_images else images
 
     def _shape(self, image: int) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of an image's pixels, and of its cells."""
@@ -81,9 +94,10 @@ class ActRay(LearnedDistribution):
         cells, found = cell_means(cell, error)
         self.l[cells], self.s[cells], self.drawn_at[cells] = found, 1.0, self.clock
         colors = composite(drawn.values["image"].cpu().numpy(), drawn.batch.background_color)
-        reached = self._pass_on(index[drawn.pixels[:, 0]].numpy(), cell, error, colors)
-        self.best_yield = max(self.best_yield, reached / len(error))
-        self.exploring &= reached / len(error) * YIELD_DROP >= self.best_yield
+        image = index[drawn.pixels[:, 0]].numpy()
+        reached, group = self._pass_on(image, cell, error, colors) / len(error), self._group_of(image)[0]
+        self.best_yield[group] = max(self.best_yield[group], reached)
+        self.exploring[group] &= reached * YIELD_DROP >= self.best_yield[group]
         if self.clock % REFRESH_STEPS == 0:
             self._refresh()
 
@@ -109,28 +123,31 @@ class ActRay(LearnedDistribution):
     def _refresh(self) -> None:
         """Compute the cells' values."""
         known, there = self.s > 0, self.cells.counts > 0
-        self.exploring &= bool((there & ~known).any())
-        if self.exploring:
-            self.cells.values[:] = np.where(known, self.l / np.maximum(self.s, 1e-8), UNKNOWN)
-        else:
-            for array in (self.l, self.s):
-                array[~known] = array[known].mean()
-            self.cells.values[:] = upper_bound(self.l / self.s, self.clock - self.drawn_at, there)
+        group = self._group_of(np.repeat(np.arange(len(self.cells)), np.diff(self.cells.first)))
+        self.exploring &= np.bincount(group, there & ~known, self._num_groups) > 0
+        explored = ~self.exploring[group]
+        number = np.maximum(np.bincount(group, known), 1)
+        for array in (self.l, self.s):
+            mean = np.bincount(group, array * known) / number
+            array[explored & ~known] = mean[group[explored & ~known]]
+        u = self.l / np.maximum(self.s, 1e-8)
+        bound = upper_bound(u, self.clock - self.drawn_at, there & explored)
+        self.cells.values[:] = np.where(explored, bound, np.where(known, u, UNKNOWN))
         self.cells.refresh()
 
     def state_dict(self) -> dict[str, Any]:
         """The estimates, and how far it is; colors are read again."""
         arrays = {name: torch.tensor(getattr(self, name)) for name in ("l", "s", "drawn_at")}
-        return {**super().state_dict(), **arrays, **{name: getattr(self, name) for name in PROGRESS}}
+        of_groups = {"exploring": self.exploring.tolist(), "best_yield": self.best_yield.tolist()}
+        return {**super().state_dict(), **arrays, **of_groups, "clock": self.clock}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` returned."""
         super().load_state_dict(state)
+        self.clock = state["clock"]
         self.l, self.s, self.drawn_at = (state[name].numpy().copy() for name in ("l", "s", "drawn_at"))
-        vars(self).update({name: state[name] for name in PROGRESS})
-
-
-PROGRESS = ("clock", "exploring", "best_yield")
+        self.exploring, self.best_yield = np.ones(self._num_groups, dtype=bool), np.zeros(self._num_groups)
+        self.exploring[:], self.best_yield[:] = state["exploring"], state["best_yield"]  # once one value for all images
 
 
 def upper_bound(u: np.ndarray, t: np.ndarray, there: np.ndarray) -> np.ndarray:

@@ -55,11 +55,21 @@ def _is_learned(state: Any, own: Mapping[str, Any], images: Sizes) -> bool:
             )
         elif name == "map":
             valid = found is None or _is_cell_table(found, images)
+        elif isinstance(own[name], list):
+            valid = _is_of_groups(found, state["cells"])
         else:
             valid = is_alike(found, own[name]) and found >= 0
         if not valid:
             return False
     return True
+
+
+def _is_of_groups(found: Any, cells: dict[str, Any]) -> bool:
+    """Numbers of each image of a table of cells, or of all together, for which earlier versions had it alone."""
+    numbers = found if isinstance(found, list) else [found]
+    return len(numbers) in {1, 1 if cells["across_images"] else len(cells["sizes"])} and all(
+        type(number) in (bool, float) and is_finite(float(number)) and number >= 0 for number in numbers
+    )
 
 
 def _is_cell_table(state: Any, images: Sizes) -> bool:
