@@ -207,6 +207,27 @@ def test_open_leaves_with_large_errors_are_subdivided_when_enough_is_known(monke
     assert set(np.unique(forest.level)) == {2, 3, 4, 5}
 
 
+def test_leaves_without_a_pixel_to_draw_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither those that are masked, nor those of an image of fewer pixels than cells."""
+    monkeypatch.setattr(quadtree, "PIXELS_PER_LEAF", 3)
+    mask = torch.zeros((40, 40), dtype=torch.bool)
+    mask[:10, :20] = True  # 2 leaves of the 16 of level 2, 8 of level 3 and 32 of level 4
+    host = batch_of([(40, 40), (3, 3)], [1, 2], stacked=False, masks=[mask, torch.ones((3, 3), dtype=torch.bool)])
+    sampler = following(rays=1, planned=10, late="quadtree", early="uniform", early_fraction=0.0, images_per_step="all")
+    part = part_of(sampler, "quadtree")
+    judged = []
+    for step in range(400):
+        before = part.forest.deepest
+        sampler.set_step(step)
+        sampler.observe(3.0 + 0 * error_at(sampler.sample(host)))
+        judged += [step + 1] * (part.forest.deepest > before)
+    leaves = np.array([2 + 9, 8 + 9, 32 + 9])  # the small image has 9 cells with a pixel at any level
+    assert judged == (3 * leaves).cumsum().tolist()
+    level = part.forest.level[0]
+    assert (level[:8, :16] == MAX_LEVEL).all()
+    assert (level[8:] == START_LEVEL).all()
+
+
 def test_an_image_that_is_met_later_begins_with_open_leaves() -> None:
     host = smooth_batch(SAME)
     sampler = trained("quadtree", {key: value[:2] for key, value in host.items()}, steps=80)

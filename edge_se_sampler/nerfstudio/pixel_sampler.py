@@ -21,6 +21,7 @@ UNBOUND = (
     "edge-se-sampler: this pixel sampler is not bound to a training run and draws uniformly, as evaluation should; "
     "to train with it, use EdgeSEDataManagerConfig or attach(trainer)"
 )
+NEEDS_WEIGHTS = "weights the loss, and nerfstudio's losses take no weights; train with edge-se"
 USE_OWN_SAMPLER = "take one of nerfstudio's own methods, whose sampler supports them"
 
 
@@ -40,7 +41,6 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
     def rules(self) -> list[tuple[str, bool, str]]:
         """Those of every host, and nerfstudio's."""
         no_weights = "nerfstudio's losses take no weights; leave it at 0, or train with edge-se"
-        needs_weights = "weights the loss, and nerfstudio's losses take no weights; train with edge-se"
         not_alone = "nerfstudio's models render coarse colors only together with the fine ones; take fine or cached"
         rules = [*super().rules(), ("error_source", self.error_source != "coarse", not_alone)]
         if self.loss_takes_weights:
@@ -49,7 +49,7 @@ class EdgeSEPixelSamplerConfig(SamplingSettings, PixelSamplerConfig):
             *rules,
             ("importance_weight", not self.importance_weight, no_weights),
             ("soft_mining_alpha", not self.soft_mining_alpha, no_weights),
-            *((phase, getattr(self, phase) != "expansive", needs_weights) for phase in ("early", "late")),
+            *((phase, getattr(self, phase) != "expansive", NEEDS_WEIGHTS) for phase in ("early", "late")),
         ]
 
     def check(self) -> None:
@@ -68,11 +68,15 @@ class EdgeSEPixelSampler(ImportantPixels, PixelSampler):
     _warned = False
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
-        """As ImportantPixels.sample; an unbound sampler says once that it draws uniformly."""
+        """As ImportantPixels.sample; an unbound sampler says once that it draws uniformly. InputError, too, for a
+        strategy of another package that weights the loss where the model's takes no weights."""
         if not self.is_bound and not self._warned:
             self._warned = True
             print(UNBOUND, file=sys.stderr)
-        return super().sample(image_batch)
+        pixels = super().sample(image_batch)
+        if "weight" in pixels and not self.config.loss_takes_weights:
+            raise InputError(f"pixel-sampler: {self.strategy} {NEEDS_WEIGHTS}")
+        return pixels
 
     def __getstate__(self) -> Any:
         """Refuse to be sent to a worker process (nerfstudio's ParallelDataManager), which has no model."""

@@ -10,8 +10,8 @@ t    steps since a pixel of the cell was drawn
 An error E found at a pixel is passed on to others: l <- (l s + E s'^2) / (s + s'), s <- (s^2 + s'^2) / (s + s'), with
 their similarity s'. Pixels are drawn in proportion to the upper confidence bound u exp(k min(t, median t)), with
 exp(k median t) = max u / (2 median u). Before, it explores: only cells without an estimate are drawn, until a step's
-errors reach 3.5 times fewer new cells a pixel than in the best step; those left get the mean. Where a step draws from one
-image, each image is explored by itself.
+errors reach 3.5 times fewer new cells a pixel than in the best step; those left get the mean. Where a step draws from
+one image, each image is explored by itself.
 
 Decided here, for a sampler sees errors and no geometry: errors are passed on to the eight neighboring cells, 64 x 64 an
 image, in place of the pixels of other images that show the same point; a cell has its central pixel's color. k is at

@@ -1,7 +1,7 @@
 """A quadtree of every image, subdivided where errors are large (Zhang et al. 2022, "Fast Learning Radiance Fields by
 Shooting Much Fewer Rays", arXiv 2208.06821).
 
-open     of the deepest level: a leaf that may be subdivided
+open     of the deepest level, and with a pixel that may be drawn: a leaf that may be subdivided
 learnt   a leaf whose errors were small when those of its level were judged; it stays as it is
 weight   of a leaf: how many pixels it can draw if it is open, at most LEARNT_PIXELS of them if it is learnt
 c        color change around a pixel, at least CHANGE_FLOOR times its mean over the image
@@ -88,6 +88,11 @@ def sum_by_cell(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np
     return sums
 
 
+def drawable_cells(valid: np.ndarray) -> np.ndarray:
+    """(SIDE, SIDE) bool: cells with a pixel of an image that is valid, (H, W) bool."""
+    return sum_by_cell(valid, *(cell_of(np.arange(length), length) for length in valid.shape)) > 0
+
+
 class Forest:
     """The trees of all images that were met, and the errors found since the deepest level was begun."""
 
@@ -95,6 +100,7 @@ class Forest:
         self.deepest = START_LEVEL
         self.row: dict[int, int] = {}  # of an image number
         self.level = np.zeros((0, SIDE, SIDE), dtype=np.uint8)  # of the leaf that a cell lies in
+        self.drawable: dict[int, np.ndarray] = {}  # by image number, cells with a pixel to draw, if not all have one
         self.error = np.zeros((0, SIDE, SIDE))  # sums
         self.count = np.zeros((0, SIDE, SIDE), dtype=np.int32)
 
@@ -116,11 +122,13 @@ class Forest:
     def subdivide(self, threshold: float) -> bool:
         """Judge the open leaves if enough pixels are known; whether any leaf has changed."""
         side = SIDE >> self.deepest
-        open_leaves = self.level[:, ::side, ::side] == self.deepest
+        by_leaf = (len(self.level), SIDE // side, side, SIDE // side, side)
+        every = np.ones((SIDE, SIDE), dtype=bool)
+        drawable = np.stack([self.drawable.get(number, every) for number in self.row]).reshape(by_leaf).any(axis=(2, 4))
+        open_leaves = drawable & (self.level[:, ::side, ::side] == self.deepest)
         number = int(np.count_nonzero(open_leaves))
         if self.deepest == MAX_LEVEL or not number or self.count.sum() < PIXELS_PER_LEAF * number:
             return False
-        by_leaf = (len(self.level), SIDE // side, side, SIDE // side, side)
         error, count = (values.reshape(by_leaf).sum(axis=(2, 4)) for values in (self.error, self.count))
         grown = open_leaves & ((error > 3 * threshold**2 * count) | (count == 0))
         self.deepest += 1
@@ -141,6 +149,9 @@ class Quadtree(Distribution):
 
     def tables(self, batch: ImageBatch) -> tuple[Any, Tensor]:
         """As `Distribution.tables`."""
+        for k, number in enumerate(batch.numbers.tolist()):
+            if number not in self.forest.drawable and (batch.mask is not None or min(batch.sizes[k]) < SIDE):
+                self.forest.drawable[number] = drawable_cells(_valid(batch, k))
         self.forest.add(batch.numbers.tolist())
         return super().tables(batch)
 
@@ -171,7 +182,11 @@ class Quadtree(Distribution):
 
     def _valid_strength(self, batch: ImageBatch, k: int) -> Tensor:
         """(H, W) strengths of the image at position k by its tree."""
-        change = color_change(batch.image(k), batch.background_color)
-        valid = np.ones(change.shape, dtype=bool) if batch.mask is None else batch.valid(k).numpy()
+        change, valid = color_change(batch.image(k), batch.background_color), _valid(batch, k)
         level = self.forest.level[self.forest.row[int(batch.numbers[k])]]
         return torch.from_numpy(leaf_strength(change, valid, level, self.forest.deepest))
+
+
+def _valid(batch: ImageBatch, k: int) -> np.ndarray:
+    """(H, W) bool: pixels of the image at position k that are not masked."""
+    return np.ones(batch.sizes[k], dtype=bool) if batch.mask is None else batch.valid(k).numpy()

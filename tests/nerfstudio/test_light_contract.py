@@ -49,7 +49,9 @@ from edge_se_sampler.errors import InputError  # noqa: E402
 from edge_se_sampler.methods import STRATEGIES  # noqa: E402
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig  # noqa: E402
 from edge_se_sampler.sampling import settings as settings_module  # noqa: E402
+from edge_se_sampler.sampling.expansive import Expansive  # noqa: E402
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels  # noqa: E402
+from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES, PixelStrategy  # noqa: E402
 
 NUMBERS = (40, 7, 23)
 """Absolute image numbers, neither in order nor from 0."""
@@ -190,6 +192,12 @@ def test_the_hosts_losses_take_no_weights_of_soft_mining() -> None:
 def test_expansive_supervision_is_refused_where_losses_take_no_weights(phase: str) -> None:
     with pytest.raises(InputError, match=rf"{phase} is 'expansive': weights the loss, and nerfstudio's losses take no"):
         EdgeSEPixelSamplerConfig(**{phase: "expansive"}).check()
+
+
+def test_a_strategy_of_another_package_that_weights_the_loss_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PIXEL_STRATEGIES, "foreign", PixelStrategy(Expansive, ("early", "late"), "of another package"))
+    with pytest.raises(InputError, match="pixel-sampler: foreign weights the loss, and nerfstudio's losses take no"):
+        bound(EdgeSEPixelSamplerConfig(early="foreign", late="foreign")).sample(BATCHES["stacked"]())
 
 
 def test_the_strategies_are_not_all_the_same_draw() -> None:
