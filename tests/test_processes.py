@@ -36,7 +36,9 @@ DENSE = {
 LEAN = {f"{MANAGER}.train_num_rays_per_batch": 250, f"{SAMPLER}.late": "se", f"{SAMPLER}.early_fraction": 0.3}
 HARD = DENSE | {f"{MODEL}.hard_samples": True}
 CACHED = {f"{SAMPLER}.error_source": "cached"}
+LEARNING = ("error-map", "error-cdf", "soft-mining", "actray", "regions", "quadtree")
 TRAININGS = {
+    **{f"dense, {name}": ("vanilla-nerf", DENSE | {f"{SAMPLER}.late": name}) for name in LEARNING},
     "dense": ("edge-se-nerf", DENSE),
     # one more than a chunk has: one of two processes has no ray of the second
     "dense, in chunks": ("edge-se-nerf", DENSE | {f"{MANAGER}.train_num_rays_per_batch": 683}),
