@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Generic, TypeVar, get_args
 
+import torch
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
@@ -17,7 +18,13 @@ from nerfstudio.utils.misc import get_orig_class
 
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig
-from edge_se_sampler.nerfstudio.resume import restore_schedule, run_progress, schedule_writer
+from edge_se_sampler.nerfstudio.resume import (
+    restore_sampler,
+    restore_schedule,
+    run_progress,
+    sampler_writer,
+    schedule_writer,
+)
 from edge_se_sampler.nerfstudio.scoring import get_background_color, observe_training_errors, ray_errors
 from edge_se_sampler.sampling.pixel_sampler import build_scorer
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
@@ -92,14 +99,15 @@ def attach(trainer: Any, **settings: Any) -> None:
 
 
 def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
-    """Bind a data manager's training sampler to the run; callbacks that set its step and write its schedule's state."""
+    """Bind a data manager's training sampler to the run; callbacks that set its step and write what it has learnt."""
     sampler, config = manager.train_pixel_sampler, trainer.config
+    rank = config.machine.machine_rank * config.machine.num_devices + trainer.local_rank
     sampler.background_color = get_background_color(trainer.pipeline.model)
     sampler.bind(
         squared_error=build_scorer(sampler, trainer.pipeline, manager.train_ray_generator, ray_errors),
         progress=run_progress(trainer),
         seed=config.machine.seed,
-        rank=config.machine.machine_rank * config.machine.num_devices + trainer.local_rank,
+        rank=rank,
         world=trainer.world_size,
     )
     callbacks = [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], sampler.set_step)]
@@ -109,6 +117,12 @@ def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
         restore_schedule(trainer, sampler.schedule)
         write_schedule = schedule_writer(trainer, sampler.schedule)
         callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], write_schedule))
+    if sampler.state_dict().keys() - {"schedule"}:
+        cameras = manager.train_dataset.cameras
+        sizes = torch.cat((cameras.height, cameras.width), dim=1).tolist()
+        restore_sampler(trainer, sampler, rank, {i: (rows, columns) for i, (rows, columns) in enumerate(sizes)})
+        write_sampler = sampler_writer(trainer, sampler, rank)
+        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], write_sampler))
     loader = manager.train_image_dataloader
     if loader.cache_all_images:
         sampler.check_images(loader.cached_collated_batch)

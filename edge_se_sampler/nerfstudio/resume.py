@@ -1,5 +1,5 @@
-"""What a resumed nerfstudio run needs for its phases, kept in files beside the run's checkpoint folder: the number of
-iterations that the first run was planned for, and the state of an adaptive schedule.
+"""What a resumed nerfstudio run needs for its pixels, kept in files beside the run's checkpoint folder: the number of
+iterations that the first run was planned for, the state of an adaptive schedule, and what strategies have learnt.
 
 nerfstudio 1.1.5 resumes for max_num_iterations *more* steps, in another folder, and its checkpoints are its own. The
 files must not lie among them: nerfstudio reads the name of every file there as that of a step.
@@ -13,12 +13,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from edge_se_sampler.engine.files import write_json
+import torch
+
+from edge_se_sampler.engine.files import write_atomically, write_json
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
+from edge_se_sampler.sampling.saved_sampler import is_sampler_state
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 
 PLAN_FILE = "edge-se-plan.json"
 SCHEDULE_FILE = "edge-se-schedule.json"
+SAMPLER_FILE = "edge-se-sampler-{rank}.pt"
+"""Of every process, of its last checkpoint: each has learnt from its own pixels."""
 
 
 def run_progress(trainer: Any) -> Callable[[int], float]:
@@ -58,16 +64,56 @@ def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
 def schedule_writer(trainer: Any, schedule: AdaptiveSchedule) -> Callable[..., None]:
     """A function to be called after each step: writes the schedule's state whenever nerfstudio saves a checkpoint, and
     raises InputError where it cannot."""
-    config, start = trainer.config, trainer._start_step
     path, states = trainer.checkpoint_dir.parent / SCHEDULE_FILE, {}
-    last = {config.max_num_iterations - 1, start + config.max_num_iterations - 1}  # of nerfstudio's main, of 1.1.5
 
     def write_schedule(step: int) -> None:
-        if trainer.local_rank == 0 and (step % config.steps_per_save == 0 or step in last):
+        if trainer.local_rank == 0 and _is_saved(trainer, step):
             states[str(step)] = schedule.state_dict()
             write_json(path, states)
 
     return write_schedule
+
+
+def restore_sampler(trainer: Any, sampler: ImportantPixels, rank: int, images: dict[int, tuple[int, int]]) -> None:
+    """Load what a sampler, bound to the run, had learnt at the loaded checkpoint from these training images (rows and
+    columns by number); a line if that is not known. InputError: the file beside the loaded checkpoint's folder holds
+    no such state."""
+    if not (loaded := _loaded_run(trainer)):
+        return
+    path, step = loaded / SAMPLER_FILE.format(rank=rank), trainer._start_step - 1
+    try:
+        found: dict[str, Any] = torch.load(path, weights_only=True) if path.exists() else {"step": None}
+        if found["step"] == step and not is_sampler_state(found["state"], sampler, images):
+            raise ValueError("it is of another training")
+    except Exception as problem:  # torch raises all kinds of a damaged file
+        raise InputError(
+            f"{path}: cannot be read ({problem!r}); delete it to let the strategies learn anew"
+        ) from problem
+    if found["step"] == step:
+        sampler.load_state_dict(found["state"])
+    else:
+        print(f"edge-se-sampler: {path} has no state of step {step}: the strategies learn anew", file=sys.stderr)
+
+
+def sampler_writer(trainer: Any, sampler: ImportantPixels, rank: int) -> Callable[..., None]:
+    """A function to be called after each step: writes what the sampler has learnt whenever nerfstudio saves a
+    checkpoint, and raises InputError where it cannot."""
+    path = trainer.checkpoint_dir.parent / SAMPLER_FILE.format(rank=rank)
+
+    def write_sampler(step: int) -> None:
+        if _is_saved(trainer, step):
+            state = {"step": step, "state": sampler.state_dict()}
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, lambda file: torch.save(state, file))
+
+    return write_sampler
+
+
+def _is_saved(trainer: Any, step: int) -> bool:
+    """Whether nerfstudio saves a checkpoint after that step."""
+    config, start = trainer.config, trainer._start_step
+    last = {config.max_num_iterations - 1, start + config.max_num_iterations - 1}  # of nerfstudio's main, of 1.1.5
+    return step % config.steps_per_save == 0 or step in last
 
 
 def _loaded_run(trainer: Any) -> Path | None:

@@ -19,7 +19,9 @@ from full_host import PLANNED, RAYS, config_of, train, trainer_of, watch  # noqa
 from nerfstudio.data.pixel_samplers import PixelSampler  # noqa: E402
 
 from edge_se_sampler.errors import InputError  # noqa: E402
-from edge_se_sampler.nerfstudio.resume import PLAN_FILE  # noqa: E402
+from edge_se_sampler.nerfstudio.resume import PLAN_FILE, SAMPLER_FILE  # noqa: E402
+
+SAMPLER = SAMPLER_FILE.format(rank=0)
 
 
 def test_the_host_is_nerfstudio_itself() -> None:
@@ -68,19 +70,53 @@ def test_a_run_stopped_in_its_early_phase_goes_on_in_it(host_scene: Path, tmp_pa
     assert strategies(seen) == [(4, "edge"), (5, "edge"), (6, "se"), (7, "se")]
 
 
-def test_a_resumed_run_draws_what_the_uninterrupted_one_draws(host_scene: Path, tmp_path: Path) -> None:
-    def drawn(trainer: Any, steps: int) -> list[torch.Tensor]:
-        seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
-        train(trainer, steps)
-        return [indices for *_, indices in seen]
+def drawn(trainer: Any, steps: int) -> list[torch.Tensor]:
+    seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
+    train(trainer, steps)
+    return [indices for *_, indices in seen]
 
+
+LEARNING: dict[str, dict[str, Any]] = {
+    **{name: {"late": name} for name in ("error-map", "error-cdf", "soft-mining", "actray", "regions", "quadtree")},
+    "se-cached": {"late": "se", "error_source": "cached"},
+}
+
+
+@pytest.mark.parametrize("strategy", ["edge", *LEARNING])
+def test_a_resumed_run_draws_what_the_uninterrupted_one_draws(strategy: str, host_scene: Path, tmp_path: Path) -> None:
     config = config_of("edge-nerf", host_scene, tmp_path, max_num_iterations=60)
+    settings = LEARNING[strategy] | {"early": "uniform", "early_fraction": 0.0} if strategy in LEARNING else {}
+    vars(config.pipeline.datamanager.pixel_sampler).update(settings)
     expected = drawn(trainer_of(copy.deepcopy(config)), 8)
     config.timestamp = "first"
     first = trainer_of(copy.deepcopy(config))
     drawn(first, 5)
-    for pixels, expected_pixels in zip(drawn(resumed(config, first), 3), expected[5:], strict=True):
+    assert (first.base_dir / SAMPLER).exists() == (strategy in LEARNING)
+    steps = (
+        1 if strategy in LEARNING else 3
+    )  # the errors that follow depend on nerfstudio's random numbers, which go on
+    for pixels, expected_pixels in zip(drawn(resumed(config, first), steps), expected[5 : 5 + steps], strict=True):
         assert torch.equal(pixels, expected_pixels)
+
+
+def test_what_was_learnt_by_another_checkpoint_is_not_taken(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
+    config = config_of("edge-nerf", host_scene, tmp_path, max_num_iterations=60)
+    vars(config.pipeline.datamanager.pixel_sampler).update(early="uniform", late="actray", early_fraction=0.0)
+    trainer = trainer_of(config)
+    train(trainer, 3)
+    path = trainer.base_dir / SAMPLER
+    saved = torch.load(path, weights_only=True)
+    torch.save(saved | {"step": 1}, path)
+    again = resumed(config, trainer)
+    assert f"{path} has no state of step 2: the strategies learn anew" in capfd.readouterr().err
+    assert not again.pipeline.datamanager.train_pixel_sampler.state_dict()["actray.distribution"]["clock"]
+    for content in (saved | {"state": {"actray.distribution": {}}}, {"step": 2}, []):
+        torch.save(content, path)
+        with pytest.raises(InputError, match=f"{SAMPLER}: cannot be read .*; delete it to let the strategies learn"):
+            resumed(config, trainer)
+    path.write_bytes(b"no state")
+    with pytest.raises(InputError, match=f"{SAMPLER}: cannot be read"):
+        resumed(config, trainer)
 
 
 def test_a_checkpoint_without_a_plan_is_reported(host_scene: Path, tmp_path: Path, capfd: Any) -> None:
