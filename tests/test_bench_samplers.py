@@ -29,6 +29,8 @@ def test_the_command_writes_every_time(tmp_path: Path, edge_se: Any) -> None:
     assert answer.code == 0, answer
     result = json.loads((tmp_path / "out" / "samplers.json").read_text())
     assert result["settings"] == {"images": 3, "size": 32, "draws": 64, "rounds": 3}
+    assert result["strategies"]["regions"]["bytes_per_pixel"] <= 5
+    assert result["strategies"]["error-map"]["bytes_per_pixel"] >= 8  # a cell is a pixel here
     readme = (tmp_path / "out" / "README.md").read_text()
     for milliseconds in result["milliseconds"].values():
         assert f"| {milliseconds:.2f} ms |" in readme

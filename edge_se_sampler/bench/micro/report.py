@@ -21,11 +21,18 @@ def describe(folder: Path) -> str:
         head = (f"{settings['draws']} pixels", f"median of {settings['rounds']} draws")
         times = parts["samplers"]["milliseconds"].items()
         parts["draws"] = markdown_table(head, [(name, f"{value:.2f} ms") for name, value in times])
+        parts["strategies"] = _tabulate_strategies(parts["samplers"].get("strategies", {}))
     if "scoring" in parts:
         scored = [result for result in results if result["benchmark"] == "scoring"]
         parts["scoring"] = "\n\n".join(map(_tabulate_scoring, scored))
     origins = [f"- `{result['command']}`, measured on {describe_machine(result['machine'])}" for result in results]
     return fill_template(__file__, folder, **parts, reproduce="\n".join(origins))
+
+
+def _tabulate_strategies(strategies: dict[str, dict[str, float]]) -> str:
+    """Empty where they were not measured: earlier results have none."""
+    rows = [(name, f"{x['build_seconds']:.2f} s", f"{x['bytes_per_pixel']:.2f}") for name, x in strategies.items()]
+    return markdown_table(("", "tables built in", "bytes a pixel"), rows) if rows else ""
 
 
 def _tabulate_scoring(result: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ import torch
 from edge_se_sampler.bench.machine import median_milliseconds, resident_memory
 from edge_se_sampler.sampling.distribution import PixelTable, UniformPixels, in_threads
 from edge_se_sampler.sampling.edges import edge_strength
+from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.pixel_sampler import EdgeSEPixelSampler
 from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.ranking import sample_by_rank
@@ -19,7 +20,8 @@ from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
 
 def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
-    """`tables` (`build_tables`), and median `milliseconds` of each kind of draw, by its label."""
+    """`tables` (`build_tables`), `strategies`: what the tables of each take, and median `milliseconds` of each kind of
+    draw, by its label."""
     table, tables = build_tables(images, size)
     every_image, one_image = torch.arange(images), torch.tensor([images // 2])
     uniform = UniformPixels([(size, size)] * images)
@@ -38,20 +40,26 @@ def measure(images: int, size: int, draws: int, rounds: int) -> dict[str, Any]:
         # what nerfstudio's PixelSampler.sample_method computes without a mask
         "for comparison: nerfstudio 1.1.5's uniform pixels": lambda _: (torch.rand((draws, 3)) * extent).long(),
     }
+    strategies = {}
     for name in ("uniform", "error-map", "error-cdf", "soft-mining", "actray", "regions", "quadtree", "expansive"):
-        cases[f"ten steps of {name}, of all images: pixels drawn, errors learnt from"] = ten_steps(
-            name, images, size, draws
-        )
-    return {"tables": tables, "milliseconds": median_milliseconds(cases, rounds)}
+        take_ten_steps, strategies[name] = prepare_strategy(name, images, size, draws)
+        cases[f"ten steps of {name}, of all images: pixels drawn, errors learnt from"] = take_ten_steps
+    return {"tables": tables, "strategies": strategies, "milliseconds": median_milliseconds(cases, rounds)}
 
 
-def ten_steps(late: str, images: int, size: int, draws: int) -> Callable[[int], None]:
-    """A function that takes ten steps with a strategy, on copies of one noise image, whose errors are random."""
+def prepare_strategy(late: str, images: int, size: int, draws: int) -> tuple[Callable[[int], None], dict[str, float]]:
+    """A function that takes ten steps with a strategy, on copies of one noise image, whose errors are random; and what
+    its tables take."""
     config = EdgeSEPixelSamplerConfig(early="uniform", late=late, images_per_step="all")
     sampler, errors = EdgeSEPixelSampler(config, num_rays_per_batch=draws), torch.rand(draws)
     sampler.bind(squared_error=lambda _: errors, progress=lambda _: 1.0, seed=0)
     noise = torch.randint(256, (1, size, size, 3), dtype=torch.uint8)
     batch = {"image": noise.expand(images, -1, -1, -1), "image_idx": torch.arange(images)}
+    start = time.perf_counter()
+    sampler.check_images(batch)
+    seconds = time.perf_counter() - start
+    table, _ = sampler.strategies[late].distribution.tables(ImageBatch.of(batch, use_mask=False))
+    held = sum(getattr(value, "nbytes", 0) for value in vars(table).values())
 
     def take(number: int) -> None:
         for step in range(10 * number + 1, 10 * number + 11):
@@ -59,7 +67,7 @@ def ten_steps(late: str, images: int, size: int, draws: int) -> Callable[[int], 
             sampler.sample(batch)
             sampler.observe(errors)
 
-    return take
+    return take, {"build_seconds": seconds, "bytes_per_pixel": held / (images * size * size)}
 
 
 def build_tables(images: int, size: int) -> tuple[PixelTable, dict[str, float]]:
