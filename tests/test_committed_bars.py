@@ -36,6 +36,16 @@ def test_cheap_squared_errors_cost_hardly_more_than_random_on_the_papers_network
     assert max(memory["coarse"], memory["cached"]) <= 1.05
 
 
+def test_no_strategy_costs_more_than_a_twentieth_of_a_small_networks_step():
+    samplers, step = result("micro/samplers.json"), result("micro/scoring-tiny.json")["milliseconds"]["random"]
+    assert samplers["settings"]["draws"] == result("micro/scoring-tiny.json")["settings"]["rays"] == 1024
+    of_ten = {name.split()[3].rstrip(","): ms for name, ms in samplers["milliseconds"].items() if "ten steps" in name}
+    assert {*of_ten} == {*samplers["strategies"]} > {"uniform", "actray", "quadtree"}
+    assert max(of_ten.values()) - of_ten["uniform"] <= 10 * step / 20
+    assert max(tables["bytes_per_pixel"] for tables in samplers["strategies"].values()) <= 5
+    assert max(tables["build_seconds"] for tables in samplers["strategies"].values()) <= 2.5
+
+
 @pytest.mark.parametrize(("seconds", "psnr"), [(3, 31), (7, 34), (20, 35), (60, 35)])
 def test_lean_nerf_on_one_core_reaches_these_psnrs(seconds: float, psnr: float):
     runs = [run for run in chart_runs("lean") if run["scene"] == "bricks"]
