@@ -121,13 +121,15 @@ class Forest:
 
     def subdivide(self, threshold: float) -> bool:
         """Judge the open leaves if enough pixels are known; whether any leaf has changed."""
+        if self.deepest == MAX_LEVEL:
+            return False
         side = SIDE >> self.deepest
         by_leaf = (len(self.level), SIDE // side, side, SIDE // side, side)
         every = np.ones((SIDE, SIDE), dtype=bool)
         drawable = np.stack([self.drawable.get(number, every) for number in self.row]).reshape(by_leaf).any(axis=(2, 4))
         open_leaves = drawable & (self.level[:, ::side, ::side] == self.deepest)
         number = int(np.count_nonzero(open_leaves))
-        if self.deepest == MAX_LEVEL or not number or self.count.sum() < PIXELS_PER_LEAF * number:
+        if not number or self.count.sum() < PIXELS_PER_LEAF * number:
             return False
         error, count = (values.reshape(by_leaf).sum(axis=(2, 4)) for values in (self.error, self.count))
         grown = open_leaves & ((error > 3 * threshold**2 * count) | (count == 0))
