@@ -144,6 +144,21 @@ def test_nerfacto_is_trained_on_small_copies_by_what_needs_no_weights(
     assert read_views(data, 1, "test").images[0].shape[:2] == (12, 12)
 
 
+def test_one_command_trains_nerfacto_on_captures_beside_all_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("lego", "fox"):
+        (tmp_path / folder).mkdir()
+    flags: Any = {"output_dir": tmp_path, "scenes_dir": tmp_path, "scenes": ("lego",), "captures": ("fox",)}
+    with pytest.raises(InputError, match="--captures"):
+        BenchStrategies(**flags).experiment()
+    monkeypatch.setattr("edge_se_sampler.bench.nerfstudio.host.find_spec", lambda _: True)
+    command = BenchStrategies(**flags, models=("nerf", NERFACTO), strategies=("uniform", "edge"), seeds=(5,))
+    trials = command.experiment().trials([])
+    assert len(trials) == len(set(trials)) == 2 * 2 * 2 * 2 * 2 + 2 * 2
+    assert {(t.model, t.downscale, t.placement) for t in trials if t.scene == "fox"} == {(NERFACTO, 8, "centered")}
+
+
 def test_an_off_center_copy_is_made_once(scene: Path, tmp_path: Path) -> None:
     command = BenchStrategies(
         output_dir=tmp_path, scenes_dir=scene.parent, scenes=("bricks",), workplace=tmp_path, placements=("shifted",)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from edge_se_sampler.bench.command import ExperimentCommand, find_scene
 from edge_se_sampler.bench.runner import Experiment
-from edge_se_sampler.errors import check_known, check_value
+from edge_se_sampler.errors import InputError, check_known, check_value
 
 if TYPE_CHECKING:
     from edge_se_sampler.bench.strategies.trials import Trial
@@ -20,13 +20,15 @@ class BenchStrategies(ExperimentCommand):
     lean-nerf with and without masks, and nerfstudio's nerfacto. Resumes."""
 
     scenes_dir: Path
-    """Folder of Blender scenes, such as NeRF-synthetic's (lego, chair, ...) with their official splits; for nerfacto
-    captures, too."""
+    """Folder of Blender scenes, such as NeRF-synthetic's (lego, chair, ...) with their official splits, and of
+    captures."""
     models: tuple[Literal["nerf", "lean", "lean-no-masks", "nerfacto"], ...] = ("nerf", "lean", "lean-no-masks")
     """NeRF of size tiny; lean-nerf; lean-nerf on images without alpha; a small nerfacto, which needs all of nerfstudio
     1.1.5 in the same environment."""
     scenes: tuple[str, ...] = ("lego", "chair")
     """Folders in it."""
+    captures: tuple[str, ...] = ()
+    """Captures in it that nerfacto is trained on, too, as they are: centered, at the coarsest of the downscales."""
     downscales: tuple[int, ...] = (8, 4)
     """Every so many pixels along both axes become one."""
     placements: tuple[Literal["centered", "shifted"], ...] = ("centered", "shifted")
@@ -47,10 +49,14 @@ class BenchStrategies(ExperimentCommand):
         check_value("downscales", self.downscales, min(self.downscales, default=0) >= 1, "at least 1 each")
         if NERFACTO in self.models:
             require_nerfstudio("--models nerfacto")
-        folders = {scene: find_scene(self.scenes_dir, scene) for scene in self.scenes}
+        elif self.captures:
+            raise InputError("--captures: only nerfacto is trained on them; add nerfacto to --models")
+        folders = {scene: find_scene(self.scenes_dir, scene) for scene in (*self.scenes, *self.captures)}
         settings, workplace = Settings(), self.workplace.resolve()
         chosen = self.strategies or tuple(STRATEGIES)
         trials = list_trials(self.models, self.scenes, self.downscales, self.placements, self.plans, chosen, self.seeds)
+        coarsest = (max(self.downscales),)
+        trials += list_trials((NERFACTO,), self.captures, coarsest, ("centered",), self.plans, chosen, self.seeds)
 
         def arguments(trial: Trial) -> tuple[Settings, Path]:
             scene = folders[trial.scene]
