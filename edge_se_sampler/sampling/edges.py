@@ -111,9 +111,18 @@ def color_change(image: np.ndarray, background: tuple[float, float, float] = WHI
     in [0, 0.5], exactly 0 where that is constant, multiples of CHANGE_STEP, so that sums in float64 are exact; borders
     are replicated. Arguments and errors as `edge_strength`.
     """
-    levels = np.rint(luma(unit_float(image), background) * np.float32(255))
+    levels = luma(unit_float(image), background)
+    levels *= 255
+    np.rint(levels, out=levels)
     total, squares = (
         cv2.boxFilter(values, cv2.CV_32F, (3, 3), normalize=False, borderType=cv2.BORDER_REPLICATE)
         for values in (levels, levels * levels)
     )  # of integers, exact
-    return np.rint(np.sqrt(9 * squares - total * total) * np.float32(1 / (9 * 255 * CHANGE_STEP))) * CHANGE_STEP
+    total *= total
+    squares *= 9
+    squares -= total
+    change = np.sqrt(squares, out=squares)  # in place throughout: new memory takes longer than the arithmetic
+    change *= np.float32(1 / (9 * 255 * CHANGE_STEP))
+    np.rint(change, out=change)
+    change *= CHANGE_STEP
+    return change

@@ -59,7 +59,8 @@ def leaf_strength(change: np.ndarray, valid: np.ndarray, level: np.ndarray, deep
         return sums[first_cell]
 
     floor = CHANGE_FLOOR * change.mean(dtype=np.float64) / CHANGE_STEP
-    c = np.maximum(change / CHANGE_STEP, np.float32(np.ceil(max(floor, 1))))  # whole numbers: sums are exact
+    c = change / CHANGE_STEP
+    np.maximum(c, np.float32(np.ceil(max(floor, 1))), out=c)  # whole numbers: sums are exact
     c *= valid
     pixels, total = by_leaf(valid), by_leaf(c)
     weight = np.where(level == deepest, pixels, np.minimum(pixels, LEARNT_PIXELS))
