@@ -43,7 +43,7 @@ def test_no_strategy_costs_more_than_a_twentieth_of_a_small_networks_step():
     assert {*of_ten} == {*samplers["strategies"]} > {"uniform", "actray", "quadtree"}
     assert max(of_ten.values()) - of_ten["uniform"] <= 10 * step / 20
     assert max(tables["bytes_per_pixel"] for tables in samplers["strategies"].values()) <= 5
-    assert max(tables["build_seconds"] for tables in samplers["strategies"].values()) <= 2.5
+    assert max(tables["build_seconds"] for tables in samplers["strategies"].values()) <= 2.0
 
 
 @pytest.mark.parametrize(("seconds", "psnr"), [(3, 31), (7, 34), (20, 35), (60, 35)])
