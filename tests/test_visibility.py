@@ -8,7 +8,7 @@ import torch
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.engine.frames import render_frame
-from edge_se_sampler.engine.rendering import CameraRays, render_outputs
+from edge_se_sampler.engine.rendering import CameraRays, Picture, render_outputs, render_view
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.ensemble import Ensemble
 from edge_se_sampler.models.lean import LeanModel
@@ -139,6 +139,17 @@ def test_what_is_rendered_does_not_depend_on_it(supersampled: bool) -> None:
     assert expected["accumulation_fine"].max() > 0.9
     for key in OUTPUTS:
         torch.testing.assert_close(found[key], expected[key], rtol=0, atol=1e-4)
+
+
+def test_a_view_is_background_where_nothing_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, camera = ball_model(1), looking((0.5, -3.0, 1.0))
+    picture = Picture("view", np.zeros((HEIGHT, WIDTH, 3), np.uint8), camera)
+    found = render_view(model, picture)
+    monkeypatch.setattr(LeanModel, "find_empty_depths", lambda self, camera: None)
+    expected = render_view(model, picture)
+    assert (expected == 1).any()
+    assert (expected < 0.9).any()
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_frames_are_those_of_a_model_that_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,10 +113,13 @@ class Cameras:
         pixels = pixels.to(self.fx.device)
         return self.generate_rays(pixels[:, :1], pixels[:, 1:] + 0.5)
 
-    def image_rays(self, camera: int, pixels: slice = slice(None)) -> RayBundle:
-        """Rays of one camera, row by row: of all its pixels, or of some, numbered in that order."""
+    def image_rays(self, camera: int, pixels: slice | Tensor = slice(None)) -> RayBundle:
+        """Rays of one camera, row by row: of all its pixels, or of some, (n,) int64 if not a slice, numbered in that
+        order."""
         height, width = int(self.height[camera]), int(self.width[camera])
-        pixel = torch.arange(*pixels.indices(height * width), device=self.fx.device)
+        if isinstance(pixels, slice):
+            pixels = torch.arange(*pixels.indices(height * width))
+        pixel = pixels.to(self.fx.device)
         coords = torch.stack((pixel // width, pixel % width), dim=1) + 0.5
         return self.generate_rays(torch.tensor([[camera]], device=pixel.device), coords)
 

@@ -50,7 +50,14 @@ class CameraRays:
         camera = camera.to(model.device, torch.float32)
         return cls(camera, model.find_empty_depths(camera))
 
-    def __getitem__(self, pixels: slice) -> RayBundle:
+    @property
+    def not_empty(self) -> torch.Tensor:
+        """(m,) numbers of the pixels whose rays may pass anything, ascending."""
+        if self.empty_depths is None:
+            return torch.arange(int(self.camera.height) * int(self.camera.width))
+        return torch.nonzero(self.empty_depths.isfinite())[:, 0]
+
+    def __getitem__(self, pixels: slice | torch.Tensor) -> RayBundle:
         rays = self.camera.image_rays(0, pixels)
         if self.empty_depths is not None:
             rays.metadata["empty_depths"] = self.empty_depths[pixels, None]
@@ -107,9 +114,9 @@ def render_view(model: RayModel, picture: Picture) -> np.ndarray:
     """A view's rendering (H, W, 3) in [0, 1]; FloatingPointError if a rendered value is not finite."""
     height, width = picture.stored.shape[:2]
     rays = CameraRays.of(model, picture.camera)
-    # all rays of a photo would take gigabytes
-    parts = [render_rays(model, rays[pixels]) for pixels in model.chunks(height * width)]
-    colors = torch.cat(parts).clamp(0, 1)
+    some, colors = rays.not_empty, torch.full((height * width, 3), model.config.background_level)
+    for chunk in model.chunks(len(some)):  # all rays of a photo would take gigabytes
+        colors[some[chunk].cpu()] = render_rays(model, rays[some[chunk]]).clamp(0, 1)
     _check_finite(colors)
     return colors.reshape(height, width, 3).numpy()
 
