@@ -142,6 +142,19 @@ def test_cameras_too_far_from_the_origin_to_be_told_apart(tmp_path: Path) -> Non
     )
 
 
+def test_a_camera_far_from_all_others_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = write_transforms(tmp_path, PINHOLE)
+    assert read_split(tmp_path, "train") is not None
+    assert capsys.readouterr().err == ""
+    document["frames"][4]["transform_matrix"][0][3] += 1e3
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert read_split(tmp_path, "train") is not None
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert "frames[4]" in line
+    assert "999 from the middle" in line
+
+
 def test_held_out_images_of_one_tripod_are_near_enough_to_the_origin(tmp_path: Path) -> None:
     document = write_transforms(tmp_path, PINHOLE)
     names = [frame["file_path"] for frame in document["frames"]]

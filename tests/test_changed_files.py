@@ -171,11 +171,16 @@ def test_every_command_takes_the_checkpoint_before_a_damaged_one(
         assert "truncated or changed" in answer.err
 
 
-@pytest.mark.parametrize("command", ["eval", "resume"])
+@pytest.mark.parametrize("command", ["eval", "resume", "render", "export"])
 def test_a_run_whose_data_has_moved_is_mended_as_its_message_says(
     command: str, trained: Path, tmp_path: Path, edge_se
 ) -> None:
-    flags = {"eval": ["--output-path", tmp_path / "eval.json"], "resume": ["--max-num-iterations", 7]}[command]
+    flags = {
+        "eval": ["--output-path", tmp_path / "eval.json"],
+        "resume": ["--max-num-iterations", 7],
+        "render": ["--output-path", tmp_path / "a.gif", "--num-frames", 2],
+        "export": ["cameras", "--output-path", tmp_path / "cameras.json"],
+    }[command]
     written = json.loads((trained / "config.json").read_text())
     moved = Path(written["data"]).rename(tmp_path / "moved")
     answer = edge_se(command, trained, *flags)

@@ -254,6 +254,7 @@ class TestRuns:
         [
             (lambda c: c.update(data="/elsewhere"), "data"),
             (lambda c: c.update(eval_every=3), "eval_every"),
+            (lambda c: c.update(masks="object"), "masks"),
             (lambda c: c.update(data_format="transforms"), "data_format"),
             (lambda c: c["pipeline"]["model"].update(background_color="black"), "background_color"),
         ],

@@ -111,7 +111,7 @@ def prepare_resume(
         config = _extend(config, state, max_num_iterations)
     session_config = replace(config, max_seconds=max_seconds)
     session_config.check()
-    _check_run_data(config)
+    check_run_data(config)
     if ranks.is_main():
         make_folder(run.path / "previews", "the run's")  # which git, for one, leaves out when it is empty
     trainer = prepare(session_config, run, saved_grid(state["model"]))
@@ -145,12 +145,13 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
 
 def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayModel, list[Path]]:
     """The model of one run, or an ensemble of the models of several, and the last checkpoint of each run; InputError if
-    a run is bad, or the runs' data, held-out views or background colors differ."""
+    a run is bad, or the runs' data, masks, held-out views or background colors differ."""
     run, config = runs[0]
     for other, found in runs[1:]:
         for name, value, expected in (
             ("data", found.data, config.data),
             ("data_format", found.data_format, config.data_format),
+            ("masks", found.masks, config.masks),
             ("eval_every", found.eval_every, config.eval_every),
             ("background_color", found.pipeline.model.background_color, config.pipeline.model.background_color),
         ):
@@ -164,7 +165,7 @@ def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayM
 
 def read_test_views(config: TrainerConfig) -> Views:
     """The held-out views of a run: its test split, or val where there is no test; InputError if there is neither."""
-    _check_run_data(config)
+    check_run_data(config)
     views = _read_first_split(config, ("test", "val"))
     if views is None:
         remedy = "transforms_test.json, transforms_val.json or another list of test images is needed"
@@ -172,7 +173,8 @@ def read_test_views(config: TrainerConfig) -> Views:
     return views
 
 
-def _check_run_data(config: TrainerConfig) -> None:
+def check_run_data(config: TrainerConfig) -> None:
+    """InputError if the folder of a run's data is not where it was."""
     if config.data is None or not config.data.is_dir():
         remedy = 'put it back, or write where it is as "data" into its config.json, without its "checksum"'
         raise InputError(f"{config.data}: no such folder, where this run's data was; {remedy}")
@@ -192,6 +194,8 @@ def _read_preview(config: TrainerConfig) -> Picture | None:
 def read_train_views(config: TrainerConfig, trains: bool = True) -> Views:
     """The training views of a config's data: all, or those of --num-views or --views. InputError for bad data, and
     where memory is too little for them and, if something trains on them, for what that takes."""
+    if not trains:
+        check_run_data(config)
     if config.data is None:
         raise InputError("--data is missing: the folder to train on (edge-se scenes makes some)")
     memory = partial(_training_memory, config) if trains else None

@@ -15,7 +15,7 @@ from edge_se_sampler.data.frames import Frame
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, write_image, write_json
-from edge_se_sampler.engine.session import select_views
+from edge_se_sampler.engine.session import check_run_data, select_views
 from edge_se_sampler.errors import InputError
 
 POINTS_NAME = "points.ply"
@@ -28,7 +28,8 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     if path.suffix.lower() != ".json":
         raise InputError(f"--output-path {path}: must end in .json")
     check_output(path)
-    assert config.data is not None  # the config is resolved
+    check_run_data(config)
+    assert config.data is not None  # or it would not be there
     lists = {
         "blender": [blender_path(config.data, split) for split in SPLITS],
         "transforms": [transforms_path(config.data)],
