@@ -7,8 +7,9 @@ import errno
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import make_dataclass
+from difflib import get_close_matches
 from typing import Annotated, Any, NoReturn, Union
 
 import tyro
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 raise
             _exit(f"{problem.filename}: cannot be used ({problem.strerror})", 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left there is not tried again
-        _exit(f"{problem.filename or 'a file'}: cannot be written ({problem.strerror})", 2)
+        _exit(f"{problem.filename or 'standard output, or a file'}: cannot be written ({problem.strerror})", 2)
     except (MemoryError, RuntimeError) as problem:
         if not _is_out_of_memory(problem):
             raise
@@ -79,15 +80,26 @@ def _run(arguments: list[str]) -> None:
         print(__version__)
     elif arguments[:1] == ["train"]:
         methods = {name: method.specification for name, method in registered_methods().items()}
+        _check_name(arguments[1:], methods, "edge-se train")
         configs = tyro.extras.subcommand_type_from_defaults(
             {name: Training(method.config) for name, method in methods.items()},
             {name: method.description for name, method in methods.items()},
         )
         _parse(_subcommands(COMMANDS | {"train": _nested(configs)}), arguments).chosen.run()
     elif arguments[:1] == ["bench"]:
+        _check_name(arguments[1:], BENCHES, "edge-se bench")
         _parse(_subcommands(COMMANDS | {"bench": _nested(_subcommands(BENCHES))}), arguments).chosen.run()
     else:
+        _check_name(arguments, COMMANDS, "edge-se")
         _parse(_subcommands(COMMANDS), arguments).run()
+
+
+def _check_name(arguments: Sequence[str], names: Iterable[str], command: str) -> None:
+    """InputError if a command's first argument is neither a flag nor one of the names, of which tyro says too much."""
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in (names := list(names)):
+        meant = get_close_matches(arguments[0], names, 1)
+        question = f"did you mean {meant[0]}? " if meant else ""
+        raise InputError(f"{command} {arguments[0]}: {question}there are {', '.join(names)}")
 
 
 def _subcommands(commands: dict[str, type]) -> Any:
@@ -103,7 +115,3 @@ def _nested(kind: Any) -> type:
 
 def _parse(kind: Any, arguments: list[str]) -> Any:
     return tyro.cli(tyro.conf.configure(tyro.conf.FlagConversionOff)(kind), args=arguments, prog="edge-se")
-
-
-if __name__ == "__main__":
-    main()

@@ -157,7 +157,7 @@ class Show(_Data):
         rays = self.pixel_sampler.num_rays_per_batch
         check_value("num-views", self.num_views, self.num_views >= 1, "at least 1")
         check_value("pixel-sampler.num-rays-per-batch", rays, 1 <= rays <= MAX_RAYS, f"from 1 to {MAX_RAYS}")
-        check_output(self.output_path)
+        check_output(self.output_path, ".png")
         views = self._read(NeRFModelConfig())
         config = EdgeSEPixelSamplerConfig(**vars(self.pixel_sampler))
         show(views, config, self.strategy, self.output_path, self.num_views, self.seed)
@@ -181,7 +181,7 @@ class Inspect(_Data):
         from edge_se_sampler.engine.files import check_output
         from edge_se_sampler.engine.inspection import inspect
 
-        check_output(self.output_path)
+        check_output(self.output_path, ".png")
         config = LeanModelConfig(near=self.near, far=self.far, voxel_size_px=self.voxel_size_px)
         print(inspect(self._read(config), config, self.output_path))
         print(self.output_path)

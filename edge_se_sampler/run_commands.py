@@ -115,8 +115,8 @@ class Render(_PictureCommand):
     dataparser_transforms: Path | None = None
     """The dataparser_transforms.json of a run of nerfstudio on the same data: the camera path is in that run's units
     and axes."""
-    num_frames: int = 60
-    """Frames of spiral and interpolate."""
+    num_frames: int | None = None
+    """Frames of spiral and interpolate, by default 60."""
     frames_per_second: float | None = None
     """Frame rate of the video; by default the camera path's, or 20."""
     depth_unit: float | None = None

@@ -9,12 +9,14 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 from tiny import SMALL
 
+from edge_se_sampler import __main__
 from edge_se_sampler.bench.commands import BENCHES
 from edge_se_sampler.commands import COMMANDS
 from edge_se_sampler.methods import STRATEGIES
@@ -88,7 +90,7 @@ def test_render_gif(run: Path, tmp_path: Path, edge_se):
 @pytest.mark.parametrize(("kind", "count"), [("interpolate", 4), ("train", 3), ("test", 1)])
 def test_render_views_and_between_them(kind: str, count: int, run: Path, tmp_path: Path, edge_se):
     folder = tmp_path / "frames"
-    flags = ["--kind", kind, "--num-frames", 4, "--outputs", "rgb", "rgba"]
+    flags = ["--kind", kind, "--outputs", "rgb", "rgba", *(["--num-frames", 4] if kind == "interpolate" else [])]
     assert edge_se("render", run, "--output-path", folder, *flags).code == 0
     assert len(list(folder.glob("rgb/*.png"))) == len(list(folder.glob("rgba/*.png"))) == count
     shown = json.loads((folder / "frames.json").read_text())["frames"]
@@ -195,7 +197,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly(arguments: str):
     """As `edge-se methods | head -1`, but the pipe is closed before anything can be written to it."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "edge_se_sampler.cli", *arguments.split()]
+    command = [sys.executable, "-m", "edge_se_sampler", *arguments.split()]
     process = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert process.returncode == 141
@@ -203,7 +205,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly(arguments: str):
 
 
 def test_head_of_a_long_help_is_quiet():
-    pipeline = f"{sys.executable} -m edge_se_sampler.cli train lean-nerf --help | head -1"
+    pipeline = f"{sys.executable} -m edge_se_sampler train lean-nerf --help | head -1"
     shown = subprocess.run(pipeline, shell=True, capture_output=True, text=True, check=True)
     assert shown.stdout.startswith("usage: ")
     assert shown.stderr == ""
@@ -216,6 +218,27 @@ def test_an_output_of_few_characters_is_no_error(arguments: str):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
     process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (process.returncode, process.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(("split", "opaque"), [("train", "training"), ("val", "held-out")])
+def test_alpha_that_only_some_views_have_is_said(split: str, opaque: str, scene: Path, tmp_path: Path, edge_se):
+    flags = ["--data", scene, "--output-dir", tmp_path / "o", *SMALL]
+    assert "alpha" not in edge_se("train", "vanilla-nerf", *flags).err
+    for path in (scene / split).iterdir():
+        iio.imwrite(path, iio.imread(path)[..., :3])
+    assert f"the {opaque} ones have none" in edge_se("train", "vanilla-nerf", *flags).err
+
+
+def test_ctrl_c_before_the_command_is_imported_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys):
+    def interrupt(name: str):
+        raise KeyboardInterrupt
+
+    module = ModuleType("edge_se_sampler.cli")
+    module.__getattr__ = interrupt  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "edge_se_sampler.cli", module)
+    with pytest.raises(SystemExit) as end:
+        __main__.main()
+    assert (end.value.code, capsys.readouterr().err) == (130, "edge-se: interrupted\n")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux's")

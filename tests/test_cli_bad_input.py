@@ -137,8 +137,9 @@ def test_settings_out_of_range(flags, named: str, scene: Path, tmp_path: Path, e
 
 
 def test_missing_and_unknown_names(tmp_path: Path, edge_se):
-    assert "trian" in rejected(edge_se, tmp_path, "trian")
-    assert "edge-se-nref" in rejected(edge_se, tmp_path, "train", "edge-se-nref")
+    assert "did you mean train?" in refused(edge_se, tmp_path, "trian")
+    assert "did you mean edge-se-nerf?" in refused(edge_se, tmp_path, "train", "edge-se-nref", "--data", tmp_path)
+    assert "strategies" in refused(edge_se, tmp_path, "bench", "everything")
     assert "demo" in rejected(edge_se, tmp_path)
     assert "--out" in rejected(edge_se, tmp_path, "scenes")
     assert "--data" in refused(edge_se, tmp_path, "train", "edge-nerf")
@@ -152,7 +153,7 @@ def test_the_hint_at_a_misspelt_flag_names_the_whole_command(tmp_path: Path, edg
 
 def test_the_parsers_message_needs_no_unicode(scene: Path):
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    command = [sys.executable, "-m", "edge_se_sampler.cli", "show", "--data", scene, "--sed", "3"]
+    command = [sys.executable, "-m", "edge_se_sampler", "show", "--data", scene, "--sed", "3"]
     answer = subprocess.run(command, env=plain, capture_output=True, text=True)
     assert answer.returncode == 2
     assert "--sed" in answer.stderr
@@ -277,7 +278,12 @@ class TestRuns:
         assert "--output-path" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "no" / "e.json")
         assert ".gif or .mp4" in refused(edge_se, run, "render", run, "--output-path", tmp_path / "x.avi")
         assert "--num-frames" in refused(edge_se, run, "render", run, "--num-frames", 0)
-        assert "--depth-unit" in refused(edge_se, run, "render", run, "--depth-unit", 1e-9)
+        for unit in (1e-9, 0.001):
+            assert "--depth-unit" in refused(edge_se, run, "render", run, "--depth-unit", unit)
+        frames = ("--output-path", run / "frames", "--num-frames", 60)
+        assert "--num-frames" in refused(edge_se, run, "render", run, *frames, "--kind", "test")
+        assert "--num-frames" in refused(edge_se, run, "render", run, *frames, "--camera-path", "path.json")
+        assert ".json" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "eval.png")
         both = ("--kind", "test", "--camera-path", tmp_path / "path.json")
         assert "give one of them" in refused(edge_se, run, "render", run, *both)
         assert "path.json" in refused(edge_se, run, "render", run, *both[2:])
@@ -310,6 +316,8 @@ class TestRuns:
 def test_outputs_of_show_and_inspect_that_cannot_be_written(command: str, scene: Path, tmp_path: Path, edge_se):
     for path in (".", tmp_path, tmp_path / "no" / "x.png"):
         assert "--output-path" in refused(edge_se, tmp_path, command, "--data", scene, "--output-path", path)
+    jpeg = tmp_path / "x.jpg"
+    assert "must end in .png" in refused(edge_se, tmp_path, command, "--data", scene, "--output-path", jpeg)
     if command == "show":
         flags = ["--data", scene, "--output-path", tmp_path / "x.png", "--pixel-sampler.num-rays-per-batch"]
         for count in (-5, 10**20):

@@ -130,7 +130,7 @@ def test_files_are_relative_to_the_json_and_points_beside_it_are_named(tmp_path:
         for i, frame in enumerate(document["frames"])
     )
     assert edge_se("export", run, "points", "--output-path", out / "points.ply", "--num-points", 99).code == 0
-    assert edge_se(*cameras).code == 0
+    assert "points.ply" in edge_se(*cameras).out
     assert json.loads((out / "transforms.json").read_text())["ply_file_path"] == "points.ply"
 
 

@@ -173,6 +173,25 @@ def test_views_without_a_mask_are_said_to_be_object_as_a_whole(
     assert not capsys.readouterr().err
 
 
+def test_views_without_alpha_among_others_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_transforms(tmp_path)
+    for name in NAMES[:6]:
+        image = iio.imread(tmp_path / "images" / name)
+        iio.imwrite(tmp_path / "images" / name, np.dstack((image[..., :3], half_mask())))
+    read(tmp_path)
+    assert "2 of 7 views have no alpha, 'images/view 06.png' for one" in capsys.readouterr().err
+
+
+def test_images_that_are_transparent_as_a_whole_are_an_error(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    for name in NAMES:
+        image = iio.imread(tmp_path / "images" / name)
+        iio.imwrite(tmp_path / "images" / name, np.dstack((image[..., :3], 0 * half_mask())))
+    with pytest.raises(InputError, match=r"'images/view 01.png' and all other views are transparent as a whole"):
+        read(tmp_path)
+    assert not read(tmp_path, "test").images[0][..., 3].any()
+
+
 def test_masks_that_no_image_has_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_transforms(tmp_path)
     (tmp_path / "masks").mkdir()

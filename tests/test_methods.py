@@ -78,7 +78,7 @@ def test_a_third_party_method_joins_and_a_broken_one_harms_nobody(site: Path, sc
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *sys.path])}
 
     def edge_se(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "edge_se_sampler.cli", *arguments]
+        command = [sys.executable, "-m", "edge_se_sampler", *arguments]
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
 
     listed = edge_se("methods")

@@ -164,7 +164,7 @@ def test_a_checkpoint_keeps_the_adaptive_schedules_state(
 def test_ctrl_c_and_a_closed_terminal_save_a_checkpoint_and_print_one_line(name: str, tmp_path: Path, scene: Path):
     number = getattr(signal, name)
     command = [
-        sys.executable, "-m", "edge_se_sampler.cli", "train", "vanilla-nerf", "--data", str(scene),
+        sys.executable, "-m", "edge_se_sampler", "train", "vanilla-nerf", "--data", str(scene),
         "--output-dir", str(tmp_path / "o"), "--pipeline.datamanager.train-num-rays-per-batch", "16",
     ]  # fmt: skip
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

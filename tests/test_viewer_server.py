@@ -123,7 +123,7 @@ def test_the_page_is_served_on_a_free_port_until_ctrl_c(run: Path, scene: Path, 
             "--viewer.port",
             0,
         ]
-    command = [sys.executable, "-m", "edge_se_sampler.cli", *map(str, flags)]
+    command = [sys.executable, "-m", "edge_se_sampler", *map(str, flags)]
     with (
         subprocess.Popen(
             command,

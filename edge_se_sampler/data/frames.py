@@ -174,8 +174,7 @@ def load_views(
         those = f"{quote(frames[0].name)} and the {len(frames) - 1} other views of its split"
         problem = f"{those} have neither masks nor alpha for --masks object"
         raise listing.error(problem, "add masks (masks/1.jpg.png for images/1.jpg), or leave the flag out")
-    if settings.masks == "object":
-        _check_objects(frames, images, settings.held_out)
+    _check_alpha(frames, images, settings)
     has_masks = any(mask is not None for mask in masks)
     if has_masks:
         masks = [np.ones(i.shape[:2], dtype=bool) if m is None else m for i, m in zip(images, masks, strict=True)]
@@ -188,13 +187,17 @@ def load_views(
     return Views(names, tuple(images), tuple(masks) if has_masks else None, cameras, memory=memory)
 
 
-def _check_objects(frames: Sequence[Frame], images: Sequence[np.ndarray], held_out: bool) -> None:
-    """InputError if masks leave no object in any view to train on; says so if views have neither mask nor alpha."""
-    if not held_out and not any(image.shape[2] == 3 or image[..., 3].any() for image in images):
-        raise frames[0].image.error("and all other views are masked as a whole", "masks are non-zero on the object")
+def _check_alpha(frames: Sequence[Frame], images: Sequence[np.ndarray], settings: LoadSettings) -> None:
+    """InputError if there is no object in any view to train on; says so if only some views tell where it is."""
+    by_masks = settings.masks == "object"
+    if not settings.held_out and not any(image.shape[2] == 3 or image[..., 3].any() for image in images):
+        problem = "masked" if by_masks else "transparent"
+        remedy = "masks are non-zero on the object" if by_masks else "alpha is above 0 on the object"
+        raise frames[0].image.error(f"and all other views are {problem} as a whole", remedy)
     whole = [frame for frame, image in zip(frames, images, strict=True) if image.shape[2] == 3]
-    if whole:
-        found = f"{len(whole)} of {len(frames)} views have neither mask nor alpha, {quote(whole[0].name)} for one"
+    if 0 < len(whole) < len(frames):
+        lacking = "neither mask nor alpha" if by_masks else "no alpha"
+        found = f"{len(whole)} of {len(frames)} views have {lacking}, {quote(whole[0].name)} for one"
         print(f"{frames[0].image.location.file}: {found}: all of them counts as the object", file=sys.stderr)
 
 

@@ -49,7 +49,7 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Evaluate the last checkpoint of a run, or of several in the mean, on the first one's held-out views, and write a
     json with the keys of nerfstudio's eval. InputError if a file is there that is no such json."""
-    check_output(output_path)
+    check_output(output_path, ".json")
     if output_path.exists() and not _is_evaluation(output_path):
         raise InputError(f"--output-path {output_path}: is no evaluation, and would be replaced by one; name another")
     model, checkpoints = load_ensemble(runs)

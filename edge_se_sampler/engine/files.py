@@ -47,12 +47,14 @@ def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) ->
                 os.close(folder)
 
 
-def check_output(path: Path, flag: str = "--output-path") -> None:
-    """Check that a file, named by a flag, can be written: its folder must exist."""
+def check_output(path: Path, *suffixes: str, flag: str = "--output-path") -> None:
+    """Check that a file, named by a flag, can be written: it must end in one of the suffixes, and its folder exist."""
     if not path.name or os.path.isdir(path):
         raise InputError(f"{flag} {path}: must name a file, not a folder")
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{flag} {path}: is no regular file, and would be replaced by one; name another")
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{flag} {path}: must end in {' or '.join(suffixes)}")
     if not os.path.isdir(path.parent):
         raise InputError(f"{flag} {path}: no such folder {path.parent}")
     if not os.access(path.parent, os.W_OK):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -59,6 +60,8 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     pipeline = Pipeline.build(config, views, device, grid)
     run = run or ranks.share(lambda: RunFolder.create(config))
     setup_seconds += time.monotonic() - began
+    if preview is not None and ranks.is_main():
+        _compare_alpha(config, views, preview)
     return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
 
 
@@ -189,6 +192,21 @@ def _read_preview(config: TrainerConfig) -> Picture | None:
     """The first held-out view of which some pixels are known; None: no view is held out."""
     views = _read_first_split(config, ("val", "test"))
     return None if views is None else to_pictures(views)[0]
+
+
+def _compare_alpha(config: TrainerConfig, views: Views, preview: Picture) -> None:
+    """Says so if the training views are transparent in part, and what is held out has no alpha, or the other way
+    round."""
+    trained, held_out = ("training", views.images), ("held-out", (preview.stored,))
+    for (some, images), (others, opaque) in ((trained, held_out), (held_out, trained)):
+        if any(map(_is_transparent, images)) and all(image.shape[2] == 3 for image in opaque):
+            problem = f"{config.data}: the {some} views have alpha, and the {others} ones have none"
+            print(f"{problem}: what is behind the object differs, and counts as an error", file=sys.stderr)
+
+
+def _is_transparent(image: np.ndarray) -> bool:
+    """Whether some of an image is."""
+    return image.shape[2] == 4 and bool((image[..., 3] < 255).any())
 
 
 def read_train_views(config: TrainerConfig, trains: bool = True) -> Views:

@@ -27,6 +27,7 @@ from edge_se_sampler.errors import InputError, check_value
 from edge_se_sampler.models.ray_model import RayModel
 
 FRAMES_PER_SECOND = 20
+NUM_FRAMES = 60
 MAX_FRAMES = 10**6
 
 
@@ -38,7 +39,7 @@ def render_run(
     kind: str | None = None,
     camera_path: Path | None = None,
     dataparser_transforms: Path | None = None,
-    num_frames: int = 60,
+    num_frames: int | None = None,
     frames_per_second: float | None = None,
     depth_unit: float | None = None,
 ) -> None:
@@ -50,7 +51,12 @@ def render_run(
         raise InputError("--kind and --camera-path: give one of them")
     if dataparser_transforms is not None and camera_path is None:
         raise InputError("--dataparser-transforms has no effect without --camera-path")
+    if num_frames is not None and (camera_path is not None or kind in ("train", "test")):
+        raise InputError("--num-frames is of the kinds spiral and interpolate: leave it out")
+    num_frames = NUM_FRAMES if num_frames is None else num_frames
     check_value("num-frames", num_frames, 1 <= num_frames <= MAX_FRAMES, f"from 1 to {MAX_FRAMES}")
+    if depth_unit is not None and output_path.suffix:
+        raise InputError("--depth-unit has no effect on a video, which cannot show raw-depth: leave it out")
     check_value("outputs", outputs, len(outputs) == len(set(outputs)) > 0, "at least one, each once")
     path = None if camera_path is None else read_camera_path(camera_path)
     if path is not None and dataparser_transforms is not None:
@@ -92,7 +98,7 @@ def check_video(path: Path, outputs: Sequence[str], frames_per_second: float) ->
     most = 50 if suffix == ".gif" else 1000
     valid = 1 <= frames_per_second <= most
     check_value("frames-per-second", f"{frames_per_second:g}", valid, f"from 1 to {most} in a {suffix[1:]}")
-    check_output(path)
+    check_output(path, suffix)
     if suffix == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401

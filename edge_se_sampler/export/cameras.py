@@ -25,9 +25,7 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     """Write the cameras of a run's data, of the images as they are in their files: at full size, with their lenses'
     distortion. Which are trained on is listed, and which are held out. Returns a line about it; InputError if the data
     or the file cannot be used."""
-    if path.suffix.lower() != ".json":
-        raise InputError(f"--output-path {path}: must end in .json")
-    check_output(path)
+    check_output(path, ".json")
     check_run_data(config)
     assert config.data is not None  # or it would not be there
     lists = {
@@ -45,14 +43,17 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     # nerfstudio wants both
     splits["val"], splits["test"] = splits["val"] or splits["test"], splits["test"] or splits["val"]
     frames = {frame.image.path: describe_frame(frame, path.parent) for split in SPLITS for frame in splits[split]}
-    _mask_all(list(frames.values()), path.parent)
+    masks = _mask_all(list(frames.values()), path.parent)
     content = share_intrinsics(list(frames.values()))
     for split in SPLITS if splits["test"] else ():  # nerfstudio wants all lists or none
         content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
+    line = f"{path}: {len(frames)} cameras, {len(splits['train'])} of them to train on"
+    line += f"; masks beside it, in which all is known, for those without: {', '.join(masks)}" if masks else ""
     if (path.parent / POINTS_NAME).is_file():
         content["ply_file_path"] = POINTS_NAME
+        line += f"; the {POINTS_NAME} that lies beside it is named as their points"
     write_json(path, content)
-    return f"{path}: {len(frames)} cameras, {len(splits['train'])} of them to train on"
+    return line
 
 
 def describe_frame(frame: Frame, folder: Path) -> dict[str, Any]:
@@ -71,14 +72,16 @@ def describe_frame(frame: Frame, folder: Path) -> dict[str, Any]:
     return entry
 
 
-def _mask_all(frames: list[dict[str, Any]], folder: Path) -> None:
+def _mask_all(frames: list[dict[str, Any]], folder: Path) -> list[str]:
     """If some frames have masks, give the others one that says that all is known, written into the folder: nerfstudio
-    wants masks of all frames or of none."""
+    wants masks of all frames or of none. Returns the names of these."""
     without = [frame for frame in frames if "mask_path" not in frame]
-    for frame in without if len(without) < len(frames) else ():
+    without = without if len(without) < len(frames) else []
+    for frame in without:
         frame["mask_path"] = f"all-known-{frame['w']}x{frame['h']}.png"
         if not (folder / frame["mask_path"]).exists():
             write_image(folder / frame["mask_path"], np.full((frame["h"], frame["w"]), 255, np.uint8))
+    return sorted({frame["mask_path"] for frame in without})
 
 
 def relative_path(file: Path, folder: Path) -> str:

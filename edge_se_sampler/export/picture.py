@@ -16,7 +16,7 @@ from edge_se_sampler.engine.frames import SEEN
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.rendering import CameraRays, Picture, render_opaque, to_pictures
 from edge_se_sampler.engine.session import read_test_views
-from edge_se_sampler.errors import InputError, check_value
+from edge_se_sampler.errors import check_value
 from edge_se_sampler.models.ray_model import RayModel
 
 PIXELS_AT_ONCE = 2**22
@@ -26,9 +26,7 @@ AMBIENT = 0.15
 
 def read_compared(config: TrainerConfig, path: Path, view: int) -> Picture:
     """The held-out view of that number; InputError if there is none, or the file cannot be written."""
-    if path.suffix.lower() != ".png":
-        raise InputError(f"--picture {path}: must end in .png")
-    check_output(path, "--picture")
+    check_output(path, ".png", flag="--picture")
     pictures = to_pictures(read_test_views(config))
     check_value("picture-view", view, 0 <= view < len(pictures), f"between 0 and {len(pictures) - 1}")
     return pictures[view]

@@ -16,9 +16,7 @@ TYPES = {"f4": "float", "u1": "uchar"}
 
 def check_export(path: Path, *suffixes: str) -> None:
     """InputError if no file with one of these suffixes can be written there, or the extra's packages are missing."""
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"--output-path {path}: must end in {' or '.join(suffixes)}")
-    check_output(path)
+    check_output(path, *suffixes)
     if any(find_spec(name) is None for name in ("manifold3d", "scipy", "skimage", "trimesh")):
         raise InputError("this needs the [export] extra: pip install 'edge-se-sampler[export]'")
 

@@ -43,7 +43,7 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
         InputError: too few images, some have masks or alpha already, in none is there an object, or masks cannot be
             written.
     """
-    check_output(picture)
+    check_output(picture, ".png")
     out = folder if out is None else out
     frames = _frames(folder, settings)
     places = [_place(folder, frame) for frame in frames]

@@ -29,7 +29,7 @@ DISTANCE = 1.5
 def write_html(run: RunFolder, config: TrainerConfig, path: Path) -> None:
     """Write a run as one html file; InputError for a bad run, data or output, or where nothing is opaque."""
     check_viser()
-    check_output(path, "--html")
+    check_output(path, ".html", flag="--html")
     viewed = Viewed.load(run, config)
     rng = stream(config.machine.seed, 0, Stream.PROBE)
     values = find_positions(viewed.model, viewed.cameras, viewed.masks, NUM_POINTS, rng)
