@@ -242,8 +242,11 @@ def test_total_variation_counts_in_every_fourth_step() -> None:
     assert float(adam.state[values]["exp_avg"][0, 0]) == pytest.approx(0.1 * 3 * weight, rel=1e-5)  # three neighbors
 
 
-def test_a_grid_that_would_be_empty_is_an_error() -> None:
+def test_a_grid_that_would_be_empty_is_an_error_once_enough_was_seen() -> None:
+    """Before, it has just not learned anything: in a training of ten steps."""
     model = full_model()
+    model.grid.update_max_weight(torch.arange(512).repeat(19), torch.full((19 * 512,), 0.001))
+    assert not model.update_cells(0.26, 0.3)
     model.grid.update_max_weight(torch.arange(512), torch.full((512,), 0.001))
     with pytest.raises(FloatingPointError, match=r"no cell has anything.*--optimizer\.lr"):
         model.update_cells(0.26, 0.3)

@@ -41,7 +41,8 @@ object: more hides what is behind, and each view would learn a picture of its ow
 SEEN_PER_ROW = 22
 """How many weights will then be seen for each row that the finest level is expected to have."""
 SEEN_PER_CELL = 20
-"""How many weights must have been seen for each of the finest cells before some are left out."""
+"""How many weights must have been seen for each cell before the finest are left out, or all of them, which is an
+error."""
 SUPERSAMPLING_START, MIN_VISITS = 0.6, 4.0
 """Part of the training after which a pixel has 2 x 2 rays, and how often all of them must have been trained on before:
 more rays tell more of what is smaller than a pixel, but other pixels tell more of what is not yet known."""
@@ -233,7 +234,8 @@ class LeanModel(RayModel):
             raise _nothing_seen()
         # before that many weights are seen, nobody knows which cells are empty
         if level < finest and now >= end and grid.num_seen >= grid.occupied.sum():
-            return self._subdivide((1 - now) / now)
+            seen = self._find_seen()
+            return bool(seen.any()) and self._subdivide(seen, (1 - now) / now)
         return False
 
     @torch.no_grad()
@@ -249,9 +251,11 @@ class LeanModel(RayModel):
         return remaining * int(self.grid.num_seen) >= SEEN_PER_ROW * expected_rows
 
     def _find_seen(self) -> Tensor:
-        """(K, 64) bool: cells that had a weight in some color. FloatingPointError: there are none."""
-        seen = self.grid.occupied & (self.grid.max_weight.view(self.grid.occupied.shape) > self.config.prune_weight)
-        if not seen.any():
+        """(K, 64) bool: cells that had a weight in some color. FloatingPointError: there are none, of many weights; of
+        few, nothing has been learned yet."""
+        grid = self.grid
+        seen = grid.occupied & (grid.max_weight.view(grid.occupied.shape) > self.config.prune_weight)
+        if not seen.any() and grid.num_seen >= SEEN_PER_CELL * grid.occupied.sum():
             raise _nothing_seen()
         return seen
 
@@ -264,7 +268,7 @@ class LeanModel(RayModel):
             grid.occupied &= unpack_bits(choose_ops(near).find_dense_cells(grid, near, 0.0))
             self.update_sampled()
 
-    def _subdivide(self, remaining: float) -> bool:
+    def _subdivide(self, seen: Tensor, remaining: float) -> bool:
         """Subdivide the cells that were seen, and those around them, as far as memory and what will be seen allow;
         False: they do not allow the finest level. Without it, this one ends later.
 
@@ -272,7 +276,7 @@ class LeanModel(RayModel):
             remaining: how much longer than until now the training goes on.
         """
         grid = self.grid
-        finer = self._find_finer(grid.to_cells(self._find_seen()), remaining)
+        finer = self._find_finer(grid.to_cells(seen), remaining)
         if finer is None:
             grid.max_level -= 1
             grid.reset_max_weight()
