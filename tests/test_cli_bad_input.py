@@ -270,6 +270,9 @@ class TestRuns:
             assert named in line
             assert str(other) in line
 
+    def test_of_itself_for_the_mean(self, run: Path, edge_se):
+        assert "named twice" in refused(edge_se, run, "eval", run, "--average-with", run / ".." / run.name)
+
     def test_with_data_that_is_gone(self, run: Path, scene: Path, edge_se):
         scene.rename(scene.with_name("moved"))
         assert "scene" in refused(edge_se, run, "eval", run)

@@ -148,8 +148,10 @@ def load_model(run: RunFolder, config: TrainerConfig) -> tuple[RayModel, Path]:
 
 def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayModel, list[Path]]:
     """The model of one run, or an ensemble of the models of several, and the last checkpoint of each run; InputError if
-    a run is bad, or the runs' data, masks, held-out views or background colors differ."""
+    a run is bad or named twice, or the runs' data, masks, held-out views or background colors differ."""
     run, config = runs[0]
+    if len({path.path.resolve() for path, _ in runs}) < len(runs):
+        raise InputError(f"--average-with: one of the runs is named twice; name others than {run.path}")
     for other, found in runs[1:]:
         for name, value, expected in (
             ("data", found.data, config.data),

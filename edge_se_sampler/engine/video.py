@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
@@ -137,31 +137,24 @@ def _write_gif(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: 
 def _write_mp4(file: BinaryIO, frames: Iterator[np.ndarray], frames_per_second: float) -> None:
     import imageio_ffmpeg
 
-    first, num_sent = next(frames), 0
+    first, num_sent, num_written = next(frames), 0, 0
     height, width = (side // 2 * 2 for side in first.shape[:2])  # the codec needs even sides
     with TemporaryDirectory(prefix=".", dir=Path(file.name).parent) as folder:  # on the disk that the video is for
         video = Path(folder) / "video.mp4"
-        rate: Any = frames_per_second  # typed as an integer; ffmpeg takes any
-        writing = imageio_ffmpeg.write_frames(str(video), (width, height), fps=rate, macro_block_size=2)
+        settings: dict[str, Any] = {"fps": frames_per_second, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+        writing = imageio_ffmpeg.write_frames(str(video), (width, height), **settings)
         with closing(writing) as writer:
             writer.send(None)
             for frame in itertools.chain([first], frames):
-                with _ffmpeg_failures():
+                try:
                     writer.send(np.ascontiguousarray(frame[:height, :width]))
+                except OSError as problem:  # of many lines
+                    raise OSError(f"ffmpeg: {str(problem).strip().splitlines()[0]}") from problem
                 num_sent += 1
-        with _ffmpeg_failures():
+        with suppress(RuntimeError):  # what it cannot read
             # imageio_ffmpeg ignores ffmpeg's exit status: only the file shows that encoding failed at the end
             num_written, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
-            if num_written != num_sent:
-                raise OSError(f"{num_written} of {num_sent} frames were written")
+        if num_written != num_sent:
+            raise OSError(f"ffmpeg wrote {num_written} of {num_sent} frames, as where a disk is full")
         with open(video, "rb") as written:
             shutil.copyfileobj(written, file)
-
-
-@contextmanager
-def _ffmpeg_failures() -> Iterator[None]:
-    """What imageio_ffmpeg raises, as an OSError in one line."""
-    try:
-        yield
-    except (OSError, RuntimeError) as problem:
-        raise OSError(f"ffmpeg: {str(problem).strip().splitlines()[0]}") from problem

@@ -104,7 +104,8 @@ def find_positions(
                 seen &= model.grid.contains(positions.to(model.device)).cpu()
             found.append(torch.cat((positions, directions, colors, opacity), dim=1)[seen])
             count += int(seen.sum())
-            progress.update(min(count, num_points))
+            looked_at = min(1.0, (start + PIXELS_AT_ONCE) / len(order))
+            progress.update(round(num_points * min(1.0, max(looked_at, count / num_points))))
             if count >= num_points:
                 break
     if count <= NEIGHBORS:
