@@ -14,6 +14,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -108,27 +109,16 @@ def load_latest(folder: Path, config_digest: str) -> tuple[Path, dict[str, Any]]
 
 def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     """Read a checkpoint; DamagedCheckpoint if it is unreadable or damaged, InputError if it holds a pickle, is none, or
-    was saved under another configuration. It is read twice, first for its checksum, so that memory holds its tensors
-    alone."""
-    with _opened(path) as file:
-        header = file.read(len(MAGIC) + 65)
-        magic = header[: len(MAGIC)]
-        if magic not in (MAGIC, MAGIC_2):
-            raise DamagedCheckpoint(f"{path}: not a checkpoint of this version of edge-se")
-        archive = _Archive(file)
-        if header[len(MAGIC) :] != _hash(b"" if magic == MAGIC_2 else magic, archive) + b"\n":
-            raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
+    was saved under another configuration. It is read twice at once, for its checksum and for its tensors, so that
+    memory holds these alone."""
+    with ThreadPoolExecutor(1) as pool:
+        checking = pool.submit(_check_sum, path)  # which of the two raises is not left to chance
         try:
-            check_archive(archive)  # pyright: ignore[reportArgumentType]
-            archive.seek(0)
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "TypedStorage")  # torch 2.1's own use of it
-                state = torch.load(archive, map_location="cpu", weights_only=True)  # pyright: ignore[reportArgumentType]
-        except (MemoryError, OSError):
+            state = _load_archive(path)
+        except Exception:
+            checking.result()
             raise
-        except Exception as problem:  # whatever a pickle that was made for it brings torch to raise
-            found = "holds more than tensors and numbers (a pickle), which is never loaded"
-            raise InputError(f"{path}: {found}") from problem
+        checking.result()
     if not isinstance(state, dict) or state.get("config_digest") != config_digest:
         raise InputError(f"{path}: saved under another configuration than the run's config.json; do not mix runs")
     try:
@@ -136,6 +126,38 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     except ValueError as problem:
         raise InputError(f"{path}: was not saved by a training ({problem}); do not use it") from problem
     return state
+
+
+def _check_sum(path: Path) -> None:
+    """DamagedCheckpoint if a checkpoint is none, or not as it was saved."""
+    with _opened(path) as file:
+        header = file.read(len(MAGIC) + 65)
+        magic = header[: len(MAGIC)]
+        if magic not in (MAGIC, MAGIC_2):
+            raise DamagedCheckpoint(f"{path}: not a checkpoint of this version of edge-se")
+        digest, block = hashlib.sha256(b"" if magic == MAGIC_2 else magic), memoryview(bytearray(2**20))
+        while size := file.readinto(block):
+            digest.update(block[:size])
+    if header[len(MAGIC) :] != digest.hexdigest().encode() + b"\n":
+        raise DamagedCheckpoint(f"{path}: truncated or changed since it was saved (checksum)")
+
+
+def _load_archive(path: Path) -> Any:
+    """What a checkpoint holds; InputError if that is more than tensors and numbers."""
+    with _opened(path) as file:
+        file.seek(len(MAGIC) + 65)
+        archive: Any = _Archive(file)
+        try:
+            check_archive(archive)
+            archive.seek(0)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "TypedStorage")  # torch 2.1's own use of it
+                return torch.load(archive, map_location="cpu", weights_only=True)
+        except (MemoryError, OSError):
+            raise
+        except Exception as problem:  # whatever a pickle that was made for it brings torch to raise
+            found = "holds more than tensors and numbers (a pickle), which is never loaded"
+            raise InputError(f"{path}: {found}") from problem
 
 
 @contextmanager
@@ -175,14 +197,6 @@ class _Archive(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int | None:
         return self._file.readinto(buffer)
-
-
-def _hash(magic: bytes, archive: _Archive) -> bytes:
-    """The sha256 of a line's beginning and the archive, in hexadecimal."""
-    digest, block = hashlib.sha256(magic), memoryview(bytearray(2**20))
-    while size := archive.readinto(block):
-        digest.update(block[:size])
-    return digest.hexdigest().encode()
 
 
 def _checkpoints(folder: Path) -> list[Path]:
