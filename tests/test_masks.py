@@ -244,7 +244,7 @@ def test_the_picture_does_not_take_the_masks_place(tmp_path: Path, images: list[
     write_capture(tmp_path / "scene", images)
     answer = edge_se("masks", "--data", tmp_path / "scene", "--output-path", tmp_path / "scene" / "masks")
     assert answer.code == 2
-    assert "the masks' folder is to be there" in answer.err
+    assert "must end in .png" in answer.err
     assert not (tmp_path / "scene" / "masks").exists()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections import Counter
 from collections.abc import Sequence
@@ -52,8 +51,6 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
             problem = f"{count} images would have the mask {place.relative_to(folder)}"
             raise SourceLocation(folder).error(problem, "give images that lie in different folders names of their own")
     targets = sorted({out / place.relative_to(folder).parts[0] for place in places})
-    if os.path.realpath(picture) in map(os.path.realpath, targets):
-        raise InputError(f"--output-path {picture}: the masks' folder is to be there; name another file")
     with staged_folders(out, targets) as workspace:
         images = _read_images(frames)
         lenses = [_scaled_camera(frame, image) for frame, image in zip(frames, images, strict=True)]
