@@ -23,7 +23,6 @@ from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import SourceLocation, quote
 from edge_se_sampler.engine.files import check_output, write_atomically
 from edge_se_sampler.engine.progress import Progress
-from edge_se_sampler.errors import InputError
 from edge_se_sampler.masks.segmentation import segment
 
 MAX_SIDE = 400
