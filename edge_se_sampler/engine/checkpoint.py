@@ -112,11 +112,11 @@ def load_checkpoint(path: Path, config_digest: str) -> dict[str, Any]:
     was saved under another configuration. It is read twice at once, for its checksum and for its tensors, so that
     memory holds these alone."""
     with ThreadPoolExecutor(1) as pool:
-        checking = pool.submit(_check_sum, path)  # which of the two raises is not left to chance
+        checking = pool.submit(_check_sum, path)
         try:
             state = _load_archive(path)
         except Exception:
-            checking.result()
+            checking.result()  # if it raises, too, that is the reason
             raise
         checking.result()
     if not isinstance(state, dict) or state.get("config_digest") != config_digest:
