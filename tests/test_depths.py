@@ -24,7 +24,8 @@ from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.occupancy.depths import NEAR_SHARE, find_depths
-from edge_se_sampler.occupancy.hull import find_focus
+from edge_se_sampler.occupancy.hull import find_box, find_focus
+from edge_se_sampler.occupancy.scene_analysis import analyze_scene
 
 
 def moved(views: Views, scale: float, shift: tuple[float, float, float]) -> Views:
@@ -64,6 +65,28 @@ def test_what_few_cameras_see_does_not_count() -> None:
     found = find_depths(replace(views, cameras=replace(views.cameras, camera_to_worlds=poses)))
     assert 2.2 < found.near <= 3
     assert found.far < 4 * 2.5 + 1.7  # where that camera sees the ball
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_a_wrong_pose_far_away_does_not_move_the_scene(has_alpha: bool) -> None:
+    views = moved(ball_views(12, 32), 1.0, (5.0, 0.0, 1.0))
+    views = views if has_alpha else opaque(views)
+    poses = views.cameras.camera_to_worlds.clone()
+    poses[3, :, 3] += 100
+    wrong = replace(views, cameras=replace(views.cameras, camera_to_worlds=poses))
+    others = views.subset([i for i in range(12) if i != 3])
+    depths = find_depths(wrong)
+    assert depths == find_depths(others)
+    box, other_box = (find_box(some, depths.near, depths.far) for some in (wrong, others))
+    np.testing.assert_array_equal(box.center, other_box.center)
+    assert (box.half_extent, box.pixel_footprint) == (other_box.half_extent, other_box.pixel_footprint)
+    found, expected = (
+        analyze_scene(some, depths.near, depths.far, voxel_size_px=1.0, by_alpha=False, near_share=depths.near_share)
+        for some in (wrong, others)
+    )
+    np.testing.assert_array_equal(found.focus, expected.focus)
+    assert found.hull.cell_size == expected.hull.cell_size
+    assert wrong.subset([0, 1, 2, 3]).leave_out_far().names == wrong.names[:4]  # of four, none is like most
 
 
 def test_points_decide_but_for_stray_ones() -> None:

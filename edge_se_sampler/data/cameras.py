@@ -13,6 +13,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+FAR = 5
+"""In distances within which nine of ten cameras are."""
+
 
 @dataclass(frozen=True)
 class RayBundle:
@@ -152,3 +155,11 @@ def rotation_power(rotation: Tensor, exponent: float) -> Tensor:
     sine = (skew * rotation).sum() / 2  # the trace is 1 + 2 cos, the skew part the axis times sin
     angle = exponent * torch.atan2(sine, (rotation.trace() - 1) / 2)
     return torch.eye(3).to(rotation) + angle.sin() * skew + (1 - angle.cos()) * skew @ skew
+
+
+def find_far(positions: np.ndarray) -> tuple[np.ndarray, float]:
+    """Which of positions (n, 3) are far from all others, (n,) bool, as those of wrong poses are, COLMAP's for one; and
+    how far from the middle of all nine of ten are. Of fewer than five, none is."""
+    distances = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    most = float(np.sort(distances)[int(0.9 * (len(positions) - 1))])
+    return (distances > FAR * most) & (most > 0) & (len(positions) >= 5), most

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.cameras import Cameras, find_far
 from edge_se_sampler.data.config import Masks
 from edge_se_sampler.data.downscale import average_pixels, shrink_mask
 from edge_se_sampler.data.image_file import ImageHeader, read_header, read_image, turn_upright
@@ -37,8 +37,6 @@ MIN_FOCAL, MAX_FOCAL = 0.01, 1e4
 """Focal lengths of cameras, in longer sides of their images: fields of view of 178 degrees, and of 20 arc seconds."""
 MAX_OFFSET = 100.0
 """Of a principal point from the center, in the larger of the image's longer side and the focal length."""
-FAR = 5
-"""In distances within which nine of ten cameras are."""
 MAX_POSITION, MAX_REMOVAL = 1e15, 1e4
 """Coordinates of a camera, world units; and how far all are from the origin, in their distances from each other, beyond
 which numbers of 32 bits move them by more than a pixel."""
@@ -129,7 +127,7 @@ def check_cameras(frames: Sequence[Frame]) -> None:
 
 def check_scene(frames: Sequence[Frame]) -> None:
     """As `check_cameras`, of all of a scene's training images, at least one; InputError, too, if they are too far from
-    the origin. One that is far from all others is named in a line: COLMAP, for one, leaves such poses."""
+    the origin. One that is far from all others is named in a line."""
     check_cameras(frames)
     positions = np.array([frame.pose[:, 3] for frame in frames])
     center = np.median(positions, axis=0)
@@ -139,8 +137,8 @@ def check_scene(frames: Sequence[Frame]) -> None:
         problem = f"its cameras are {removal:.3g} from the origin, but only {spread:.3g} from each other"
         remedy = "subtract the same position from all poses, so that the origin is among them"
         raise SourceLocation(frames[0].image.location.file).error(problem, remedy)
-    most = np.sort(distances)[int(0.9 * (len(frames) - 1))]
-    if most > 0 and spread > FAR * most:
+    far, most = find_far(positions)
+    if far.any():
         problem = (
             f"has its camera {spread:.3g} from the middle of all cameras, nine of ten of which are within {most:.3g}"
         )

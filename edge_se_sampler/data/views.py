@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edge_se_sampler.data.cameras import Cameras
+from edge_se_sampler.data.cameras import Cameras, find_far
 
 NERF_SYNTHETIC_DEPTHS, NERF_SYNTHETIC_DISTANCES = (2.0, 6.0), (3.5, 4.5)
 """Between them lie NeRF's Blender scenes, and how far their cameras are from the origin, world units."""
@@ -39,6 +39,11 @@ class Views:
         names, images = zip(*((self.names[i], self.images[i]) for i in indices), strict=True)
         cameras = self.cameras[list(indices)]
         return replace(self, names=names, images=images, masks=masks, cameras=cameras, points=points)
+
+    def leave_out_far(self) -> Views:
+        """Without the views of cameras that are far from all others: they do not tell where the scene is."""
+        far, _ = find_far(self.cameras.camera_to_worlds[:, :, 3].numpy())
+        return self.subset(np.flatnonzero(~far).tolist()) if far.any() else self
 
     def with_masks(self, masks: Sequence[np.ndarray]) -> Views:
         """The same views, to be trained on only where both `masks` and the views' own, if any, are True."""

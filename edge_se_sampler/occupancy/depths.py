@@ -55,6 +55,7 @@ def find_depths(views: Views) -> DepthRange:
     """The depths of a scene, from its training views; InputError if nothing tells."""
     if views.depths is not None:
         return DepthRange(*views.depths, "NeRF's Blender scenes")
+    views = views.leave_out_far()
     found = (
         _depths_of_points(views)
         or _depths_of_silhouettes(views)

@@ -86,14 +86,15 @@ def find_box(views: Views, near: float, far: float) -> Box:
     """The cube around the point nearest to all optical axes that reaches as far along every axis as rays are sampled,
     from depth near to far, world units. Where that point is not between these (axes that are parallel, or diverge), it
     is around the mean point halfway between them."""
-    center, depth = find_focus(views.cameras)
+    cameras = views.leave_out_far().cameras
+    center, depth = find_focus(cameras)
     if not near < np.median(depth) < far:
-        poses = views.cameras.camera_to_worlds.numpy()
+        poses = cameras.camera_to_worlds.numpy()
         position, forward = poses[:, :, 3], -poses[:, :, 2]
         center = (position + forward * (near + far) / 2).mean(axis=0)
         depth = ((center - position) * forward).sum(axis=1)
     half_extent = float(np.maximum(far - depth, depth - near).clip(min=0).max())
-    focal = (views.cameras.fx + views.cameras.fy)[:, 0].numpy() / 2
+    focal = (cameras.fx + cameras.fy)[:, 0].numpy() / 2
     return Box(center, half_extent, float(np.median(depth.clip(min=1e-6 * half_extent) / focal)))
 
 

@@ -92,8 +92,9 @@ def analyze_scene(
     if hull is None:
         raise _nothing_seen(box)
     num_pixels = sum(_count_shown(views, i, bool(silhouettes)) for i in range(len(views.images)))
-    point, _ = find_focus(views.cameras)
-    focus = np.array([*point, near_share, views.cameras.find_distances(point).max()])
+    cameras = views.leave_out_far().cameras
+    point, _ = find_focus(cameras)
+    focus = np.array([*point, near_share, cameras.find_distances(point).max()])
     return SceneAnalysis(
         box, len(silhouettes), show_whole_object(silhouettes), hull, max_level, hit_pixels, num_pixels, focus
     )
