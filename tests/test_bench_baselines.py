@@ -146,6 +146,7 @@ def test_every_seed_is_trained_and_kept(data: Path, tmp_path: Path, edge_se: Any
         assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_program_reads_a_smaller_copy(data: Path, tmp_path: Path, edge_se: Any) -> None:
     text = NERF_PYTORCH.replace("(1, 24, 24, 3)", "(1, 12, 12, 3)")
     program = checkout(tmp_path / "program", "run_nerf.py", text)
@@ -160,6 +161,7 @@ def test_a_program_reads_a_smaller_copy(data: Path, tmp_path: Path, edge_se: Any
     assert "--downscale is 2: must be 1 without --data" in answer.err
 
 
+@pytest.mark.slow
 def test_a_program_that_refuses_its_flags_or_ends_early_is_named_in_one_line(
     data: Path, tmp_path: Path, edge_se: Any
 ) -> None:

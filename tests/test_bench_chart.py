@@ -99,6 +99,7 @@ def ticks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ChartSettings, "clock", lambda _: 0.01 * next(count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guess", [10, 100_000])
 @pytest.mark.usefixtures("ticks")
 def test_a_plan_that_misses_its_time_is_made_again(guess: int, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -223,6 +223,7 @@ def small_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "executor_factory", lambda *_: lambda: ThreadPoolExecutor(1))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_settings")
 def test_the_command_trains_a_subset_and_reports_it(tmp_path: Path, edge_se: Callable[..., Any]) -> None:
     out = tmp_path / "new" / "out"

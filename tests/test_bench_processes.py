@@ -34,6 +34,7 @@ def test_processes_pay_from_where_no_larger_step_is_slower(ratios: tuple[float, 
     assert describe_break_even(runs(*ratios)) == verdict
 
 
+@pytest.mark.slow
 def test_a_call_reaches_every_rank() -> None:
     with timing.start_ranks(2, 1) as call:
         assert call(ranks.agree, 3.0) == [[3.0], [3.0]]

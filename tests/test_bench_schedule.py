@@ -113,6 +113,7 @@ def test_the_adaptive_schedule_is_compared_with_the_share_selected_on_other_seed
 # -- the command
 
 
+@pytest.mark.slow
 def test_the_command_trains_in_stages_what_is_pending(
     tmp_path: Path, edge_se: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

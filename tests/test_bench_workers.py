@@ -132,6 +132,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_worker_that_starts_leaves_ctrl_c_to_its_parent(tmp_path: Path) -> None:
     with run_script(STARTING, tmp_path) as process:
         assert process.stdout is not None

@@ -362,6 +362,7 @@ def test_any_change_of_llffs_bounds(data: st.DataObject, images: Path) -> None:
     accept(images)
 
 
+@pytest.mark.slow
 @HYPOTHESIS
 @given(data=st.data())
 def test_any_change_of_a_mask(data: st.DataObject, images: Path) -> None:
@@ -437,6 +438,7 @@ def test_any_change_of_a_json(name: str, data: st.DataObject, images: Path) -> N
     accept(images)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [False, True])
 @HYPOTHESIS
 @given(data=st.data())

@@ -68,6 +68,7 @@ def trained(_trained: Path, scene: Path, tmp_path: Path) -> Path:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [SOME, MANY])
 def test_a_changed_checkpoint(times: int, trained: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder, rng = RunFolder(trained), random.Random(0)

@@ -113,6 +113,7 @@ print(load_checkpoint(large, "d")["w"].shape)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc and RLIMIT_AS")
 def test_loading_takes_little_more_memory_than_the_tensors(tmp_path: Path):
     small = save_checkpoint(tmp_path, 1, state(1.0))
@@ -197,6 +198,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_checkpoint_loads_after_a_kill_at_a_random_moment(tmp_path: Path):
     moments = random.Random(0)
     for _ in range(3):

@@ -73,6 +73,7 @@ def found_by(trainer: Trainer) -> list[float]:
     return losses + render_rays(trainer.pipeline.model, rays).flatten().tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "changes"),
     [
@@ -89,6 +90,7 @@ def test_nerfs_train_on_a_device_of_their_own(method: str, changes: dict[str, An
     assert found == pytest.approx(found_by(nerf_trainer(method, "cpu", **changes)), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_lean_nerf_trains_on_a_device_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voxel_backend, "compiled_ops", lambda: None)
     with fake_device():

@@ -132,6 +132,7 @@ def test_a_training_goes_on_once_there_is_room(
     print(f"{disk_writes} writes, {resumed} resumed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("some", [2, ALL])
 @pytest.mark.parametrize(
     "flags",

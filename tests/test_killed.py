@@ -66,6 +66,7 @@ def train_flags(scene: Path, output_dir: Path) -> list[object]:
     return ["train", "edge-se-nerf", "--data", scene, *SMALL, *rest, "--pipeline.model.width", 8]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kills", [4, MANY])
 def test_trainings_survive(
     kills: int, scene: Path, tmp_path: Path, commands: KillableCommands, capfd: pytest.CaptureFixture[str]

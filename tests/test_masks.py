@@ -87,6 +87,7 @@ def found(images: list[np.ndarray]) -> list[np.ndarray]:
     return segment(some, [LENS] * COUNT, poses())
 
 
+@pytest.mark.slow
 def test_an_object_is_found_and_the_hole_through_it_stays_open(
     found: list[np.ndarray], truth: list[np.ndarray]
 ) -> None:
@@ -96,6 +97,7 @@ def test_an_object_is_found_and_the_hole_through_it_stays_open(
     assert not any(mask[middle, middle] for mask in found)
 
 
+@pytest.mark.slow
 def test_views_outvote_what_one_of_them_alone_takes_for_the_object(found: list[np.ndarray]) -> None:
     assert not found[STAINED][12:24, 12:24].any()
 

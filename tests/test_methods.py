@@ -74,6 +74,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+@pytest.mark.slow
 def test_a_third_party_method_joins_and_a_broken_one_harms_nobody(site: Path, scene: Path, tmp_path: Path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *sys.path])}
 

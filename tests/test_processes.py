@@ -121,6 +121,7 @@ def check_same_losses(trainings: list[str], scene: Path, output_dir: Path) -> No
     assert len(list(output_dir.glob("two/*/*/*/checkpoints/*.ckpt"))) == len(trainings)
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_loss_curve_of_one(scene: Path, tmp_path: Path) -> None:
     check_same_losses(["lean, without alpha"], scene, tmp_path)
 

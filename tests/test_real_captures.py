@@ -44,6 +44,7 @@ def test_fox(capsys: pytest.CaptureFixture[str]) -> None:
     assert 9 < found.far < 11
 
 
+@pytest.mark.slow
 def test_colmap_mug() -> None:
     """Every point that a view sees lies in its image, in front of it."""
     train = read("colmap_mug", downscale=4)
@@ -65,6 +66,7 @@ def test_colmap_mug() -> None:
     assert without.far == pytest.approx(found.far, rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "near", "far", "source"),
     [
@@ -82,6 +84,7 @@ def test_masked_objects(name: str, near: tuple[float, float], far: tuple[float, 
     assert far[0] < found.far < far[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "near", "far"), [("dtu_scan24", (1.8, 2.2), (4.0, 5.2)), ("ethiopianHead", (2.8, 3.3), (5.1, 6.5))]
 )

@@ -159,6 +159,7 @@ def test_a_checkpoint_keeps_the_adaptive_schedules_state(
     assert train(resume_trainer(trainer, views), later) == went_on
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="its processes get no signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
 def test_ctrl_c_and_a_closed_terminal_save_a_checkpoint_and_print_one_line(name: str, tmp_path: Path, scene: Path):

@@ -88,6 +88,7 @@ def test_an_early_phase_that_learned_and_is_over_is_not_missed(early: str, late:
         assert not is_sampler_state(state, other, IMAGES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SETTINGS)
 def test_any_change_is_drawn_from_or_refused(kind: str) -> None:
     sampler = sampler_of(kind)

@@ -112,6 +112,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(votes, "RESOLUTIONS", (8, 16))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CASES)
 def test_any_change(kind: str, folders: Folders, tmp_path: Path) -> None:
     attack_command(kind, range(CASES[kind][0]), folders, tmp_path)

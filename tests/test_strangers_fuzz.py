@@ -54,6 +54,7 @@ CHEAP: dict[str, tuple[int, Callable[[Folders], Callable[[random.Random], None]]
 """How many of each, and what."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CHEAP)
 def test_any_change(kind: str, folders: Folders) -> None:
     count, case = CHEAP[kind]

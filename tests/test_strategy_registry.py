@@ -70,6 +70,7 @@ def test_names_that_are_taken_and_classes_that_cannot_be_imported(tmp_path: Path
     assert last.endswith("InputError: pixel strategy nowhere:Lost cannot be imported: No module named 'nowhere'")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["dark_pixels : DarkPixels", "dark_pixels:Outer.DarkPixels"])
 def test_entry_points_are_what_pythons_standard_says(target: str, tmp_path: Path) -> None:
     environment = install(tmp_path, f"dark = {target}")

@@ -206,6 +206,7 @@ def test_a_full_disk_is_reported_and_leaves_nothing_behind(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="no process groups to interrupt")
 @pytest.mark.parametrize("moment", ["half a semaphore", "half a worker", "workers starting", "workers at work"])
 def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
