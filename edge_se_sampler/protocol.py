@@ -58,7 +58,8 @@ class PixelSampler(ABC):
         self.config = config
         self.kwargs = kwargs
         self.config.keep_full_image = kwargs.get("keep_full_image", config.keep_full_image)
-        self.set_num_rays_per_batch(kwargs.get("num_rays_per_batch", config.num_rays_per_batch))
+        self.config.num_rays_per_batch = kwargs.get("num_rays_per_batch", config.num_rays_per_batch)
+        self.set_num_rays_per_batch(self.config.num_rays_per_batch)
 
     def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
         """Change how many pixels a step draws."""

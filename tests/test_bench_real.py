@@ -20,6 +20,7 @@ from edge_se_sampler.bench.real.summary import seconds_of
 from edge_se_sampler.bench.real.trials import MEMBERS, VARIANTS, Settings, Trial, run_trial, training_length
 from edge_se_sampler.bench.results import new_result, write_result
 from edge_se_sampler.data.synthetic.folder import make_scenes
+from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
 
 RUN = {
@@ -44,6 +45,15 @@ def test_a_training_is_measured_on_every_split(scenes: Path, tmp_path: Path) -> 
     assert 12 < run["psnr"] < 40
     assert len({run[name] for name in ("psnr", "val_psnr", "train_psnr")}) == 3  # other views each
     assert 0.2 < run["memory"] < 4
+
+
+def test_a_training_that_was_stopped_is_none(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(trainer: Trainer) -> None:
+        trainer.stop_requested = True  # as by a SIGTERM
+
+    monkeypatch.setattr(Trainer, "train", stop)
+    with pytest.raises(KeyboardInterrupt):
+        trials._train(Trial("bricks", 1, "2s", "lean-nerf", 0), 0, scenes, tmp_path)
 
 
 @pytest.mark.slow

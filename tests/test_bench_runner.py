@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,22 @@ def test_later_trials_may_depend_on_earlier_runs(tmp_path: Path) -> None:
 
     result = run_experiment(toy_experiment(trials=trials), tmp_path, one_thread)
     assert [(run["scene"], run["seed"]) for run in result["runs"]] == [("chair", 2), ("mic", 0), ("mic", 1), ("mic", 2)]
+
+
+def test_what_trainings_need_is_made_before_any_begins(tmp_path: Path) -> None:
+    """A training that ended meanwhile could be lost."""
+    order: list[str] = []
+
+    def arguments(trial: ToyTrial) -> tuple[object, ...]:
+        order.append(f"made for {trial.seed}")
+        return ()
+
+    def begin() -> Executor:
+        order.append("begins")
+        return one_thread()
+
+    run_experiment(replace(toy_experiment(), arguments=arguments), tmp_path, begin)
+    assert order == ["made for 0", "made for 1", "made for 2", "begins"]
 
 
 def test_a_failing_trial_is_reported_stops_no_other_and_is_tried_again(

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_folder import HEIGHT, WIDTH, write_colmap
 
 from edge_se_sampler.bench.results import new_result, write_result
 from edge_se_sampler.bench.strategies.claims import CLAIMS
@@ -20,6 +21,7 @@ from edge_se_sampler.bench.strategies.report import describe, describe_use, draw
 from edge_se_sampler.bench.strategies.summary import (
     Panel,
     best_at_equal_seconds,
+    captures_of,
     compare,
     cost_of_a_step,
     count_failures,
@@ -150,13 +152,33 @@ def test_one_command_trains_nerfacto_on_captures_beside_all_else(
     for folder in ("lego", "fox"):
         (tmp_path / folder).mkdir()
     flags: Any = {"output_dir": tmp_path, "scenes_dir": tmp_path, "scenes": ("lego",), "captures": ("fox",)}
-    with pytest.raises(InputError, match="--captures"):
-        BenchStrategies(**flags).experiment()
     monkeypatch.setattr("edge_se_sampler.bench.nerfstudio.host.find_spec", lambda _: True)
+    with pytest.raises(InputError, match="add lean-no-masks or nerfacto to --models"):
+        BenchStrategies(**flags, models=("nerf", "lean")).experiment()
     command = BenchStrategies(**flags, models=("nerf", NERFACTO), strategies=("uniform", "edge"), seeds=(5,))
     trials = command.experiment().trials([])
     assert len(trials) == len(set(trials)) == 2 * 2 * 2 * 2 * 2 + 2 * 2
     assert {(t.model, t.downscale, t.placement) for t in trials if t.scene == "fox"} == {(NERFACTO, 8, "centered")}
+
+
+def test_lean_nerf_is_trained_on_a_capture_for_as_long_as_is_said(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "mug")
+    flags: Any = {
+        "output_dir": tmp_path,
+        "scenes_dir": tmp_path,
+        "scenes": (),
+        "captures": ("mug",),
+        "downscales": (2,),
+    }
+    command = BenchStrategies(**flags, models=("lean-no-masks",), plans=("seconds",), seeds=(1,), lean_seconds=1)
+    experiment = command.experiment()
+    trial = experiment.trials([])[0]
+    run = run_trial(trial, *experiment.arguments(trial))
+    assert 0.9 < run["seconds"] < 5  # not the 10 that is usual
+    assert run["size"] == [WIDTH // 2, HEIGHT // 2]
+    assert run["foreground_psnr"] is run["foreground_share"] is None
+    assert run["outcome"] in ("converged", "underfit")
+    assert captures_of([asdict(trial) | run]) == ["mug"]
 
 
 def test_an_off_center_copy_is_made_once(scene: Path, tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_weights_and_their_moments_are_in_the_estimate(size: Any) -> None:
     config = NeRFModelConfig(size=size)
     weights = sum(weight.numel() for weight in NeRFModel(config, np.random.default_rng(0)).parameters())
     of_points = 2 * 4 * config.preset.width * (config.preset.depth + 2) * 2**14
-    assert 16 * weights < config.training_memory(True) - of_points < 1.5 * 16 * weights
+    assert 16 * weights < config.training_memory(True, 1024) - of_points < 1.5 * 16 * weights
 
 
 def test_train_and_inspect_say_what_training_takes(

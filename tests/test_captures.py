@@ -362,3 +362,29 @@ def test_coefficients_in_quotes(tmp_path: Path) -> None:
         del document[key]
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     np.testing.assert_array_equal(read(tmp_path).images[2], expected)
+
+
+def test_coefficients_in_one_list(tmp_path: Path) -> None:
+    """As nerfstudio reads them, too, and before those by name."""
+    document = write_transforms(tmp_path, OPENCV)
+    expected = read(tmp_path).images[2]
+    document |= {"distortion_params": [document["k1"], document["k2"], 0, 0, document["p1"], document["p2"]], "k1": 0.3}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    np.testing.assert_array_equal(read(tmp_path).images[2], expected)
+
+
+def test_a_fisheyes_crop_radius_is_refused_and_others_have_none(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path, PINHOLE) | {"fisheye_crop_radius": 20.0}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert read(tmp_path).masks is None
+    document["camera_model"] = "OPENCV_FISHEYE"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"fisheye_crop_radius: is not supported; .*masks"):
+        read(tmp_path)
+
+
+def test_a_blender_scenes_cameras_must_be_perspective_ones_too(tmp_path: Path) -> None:
+    document = write_blender(tmp_path) | {"equirectangular": True}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="equirectangular: is of a camera that is not supported"):
+        read(tmp_path)

@@ -20,8 +20,10 @@ from capture_folder import (
     OPENCV,
     PINHOLE,
     Distortion,
+    picture,
     read,
     transforms,
+    turned_jpeg,
     write_colmap,
     write_transforms,
 )
@@ -185,3 +187,69 @@ def test_data_that_is_gone_is_an_error(tmp_path: Path, edge_se: Callable) -> Non
     assert answer.code == 2
     assert "frames" in answer.err
     assert not (tmp_path / "transforms.json").exists()
+
+
+APPLIED = [[0.0, 0.0, 1.0, 2.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 3.0]]
+OLD_COLMAP = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+"""What nerfstudio takes where a folder has a model of COLMAP's, and a json without this."""
+NOTHING = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("written", APPLIED), ("old", OLD_COLMAP), ("none", NOTHING), ("colmap", NOTHING)]
+)
+def test_what_had_been_done_to_the_cameras_before_is_said(kind: str, expected: list, tmp_path: Path) -> None:
+    """Else nerfstudio would take something for it, or nothing; a path that is drawn there returns by it."""
+    if kind == "colmap":
+        write_colmap(tmp_path)
+        (tmp_path / "colmap").mkdir()
+        (tmp_path / "sparse").rename(tmp_path / "colmap" / "sparse")
+    else:
+        document = write_transforms(tmp_path)
+        if kind == "written":
+            document |= {"applied_transform": APPLIED, "applied_scale": 2.5}
+        elif kind == "old":
+            (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
+        (tmp_path / "transforms.json").write_text(json.dumps(document))
+    export_cameras(config_of(tmp_path, "colmap" if kind == "colmap" else "transforms"), tmp_path / "cameras.json")
+    written = json.loads((tmp_path / "cameras.json").read_text())
+    assert written["applied_transform"] == expected
+    assert written["applied_scale"] == (2.5 if kind == "written" else 1)
+
+
+def test_masks_that_nerfstudio_would_read_otherwise_are_written_anew(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    shown = np.zeros((HEIGHT, document["w"]), np.uint8)
+    shown[:, 7:] = 255
+    colors = np.repeat(shown[..., None], 3, axis=2)
+    nearly = np.where(shown > 0, np.uint8(250), np.uint8(4))
+    (tmp_path / "masks").mkdir()
+    for i, mask in enumerate([shown, colors, np.dstack((colors, shown))]):
+        iio.imwrite(tmp_path / "masks" / NAMES[i], mask)
+    (tmp_path / "masks" / f"{NAMES[3]}.jpg").write_bytes(iio.imwrite("<bytes>", nearly, extension=".jpg"))
+    iio.imwrite(tmp_path / "images" / f"dynamic_mask_{Path(NAMES[4]).stem}.png", 255 - shown)
+    for i in (3, 4):
+        document["frames"][i]["file_path"] = f"images/{NAMES[i]}"
+    document["frames"][3]["mask_path"] = f"masks/{NAMES[3]}.jpg"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    line = export_cameras(config_of(tmp_path, "transforms"), tmp_path / "cameras.json")
+    assert "4 masks written anew" in line
+    frames = {frame["file_path"]: frame for frame in json.loads((tmp_path / "cameras.json").read_text())["frames"]}
+    for i in range(5):
+        mask = iio.imread(tmp_path / frames[f"images/{NAMES[i]}"]["mask_path"])
+        np.testing.assert_array_equal(mask, shown)  # gray
+    assert frames[f"images/{NAMES[0]}"]["mask_path"] == f"masks/{NAMES[0]}"
+
+
+def test_what_nerfstudio_does_not_heed_is_said(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    document["frames"][2]["camera_model"] = "OPENCV_FISHEYE"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    line = export_cameras(config_of(tmp_path, "transforms"), tmp_path / "cameras.json")
+    assert "nerfstudio takes all cameras for perspective ones" in line
+    assert "orientation" not in line
+    write_transforms(tmp_path)
+    (tmp_path / "images" / NAMES[1]).write_bytes(turned_jpeg(np.rot90(picture(1)), 6))
+    line = export_cameras(config_of(tmp_path, "transforms"), tmp_path / "cameras.json")
+    assert "EXIF orientation says, as 1 of these have to be" in line
+    assert "perspective" not in line

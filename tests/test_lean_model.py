@@ -72,6 +72,13 @@ def test_the_fog_of_carved_cells_is_dense_but_for_very_small_ones(max_level: int
     torch.testing.assert_close(carved.density.detach(), torch.full((len(carved.density), 1), expected))
 
 
+@pytest.mark.parametrize("changes", [{"step_size_voxels": 0.05}, {"alpha_threshold": 0.2}])
+def test_the_fog_is_sampled_whatever_is_left_out(changes: dict[str, Any]) -> None:
+    grid = BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, torch.ones((8, 8, 8), dtype=torch.bool), 2)
+    model = LeanModel(LeanModelConfig(size="tiny", **changes), np.random.default_rng(0), grid)
+    assert float(model.density.detach().min()) > model.marching.density_min > INITIAL_RAW_DENSITY
+
+
 @pytest.mark.parametrize(("share", "expected"), [(0.0, (2.0, 2.0, 2.0)), (0.5, (2.0, 2.5, 3.0))])
 def test_rays_begin_at_a_share_of_the_way_to_the_focus(share: float, expected: tuple[float, ...]) -> None:
     """From 3, 5 and 12 away, 3 beyond where training views were at most 6 away; near is 2."""

@@ -27,6 +27,7 @@ from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.viewer.viewed import Viewed
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +88,7 @@ def test_a_time_budget_is_kept_where_a_resumed_run_is_set_up_sooner(
         ({"time_budget": "0"}, "--time-budget is '0'"),
         ({"time_budget": "60", "max_num_iterations": 7}, "--max-num-iterations and --time-budget"),
         ({"segments": (1, 2, 3)}, "--segments"),
+        ({"optimizer.eps": 0.0}, "--optimizer.eps is 0.0: must be above 0 for lean-nerf"),
         ({f"{MODEL}.prune_weight": 1.0}, "prune-weight"),
         ({f"{MODEL}.max_memory": 0.0}, "max-memory"),
         ({f"{MODEL}.max_memory": 1e300}, "max-memory"),
@@ -183,8 +185,20 @@ def test_a_run_is_not_resumed_on_a_scene_that_has_changed(larger: Path, tmp_path
     changed_pixels = iio.imread(image)
     changed_pixels[:12] = 255
     iio.imwrite(image, changed_pixels)
-    with pytest.raises(InputError, match="cells are not the checkpoint's"):
+    with pytest.raises(InputError, match=r"cells are not the checkpoint's.* --changed-data True"):
         prepare_resume(trainer.run, trainer.config)
+    grid = trainer.pipeline.model.grid
+    resumed = prepare_resume(trainer.run, trainer.config, max_num_iterations=3, changed_data=True)
+    assert resumed.pipeline.model.grid.is_of_the_same_scene(grid)
+    resumed.train()
+    assert resumed.next_step == 3
+    assert Viewed.load(trainer.run, trainer.config).model.grid.is_of_the_same_scene(grid)  # as rendering does
+
+
+def test_a_budget_and_what_one_came_out_as_are_not_both_given(larger: Path, tmp_path: Path) -> None:
+    config = override(lean_config(larger, tmp_path), {"time_budget": "10m", "segments": (1,) * 100})
+    with pytest.raises(InputError, match="--time-budget and --segments: give one of them"):
+        prepare(config)
 
 
 def test_weights_of_another_model_are_refused() -> None:

@@ -133,6 +133,7 @@ def test_black_and_white_of_jpegs_are_rounded(tmp_path: Path) -> None:
         ("images_4/a.jpg", "masks/a.png"),
         ("train/a.png", "masks/train/a.png"),
         ("a.jpg", "masks/a.png"),
+        ("images/b/a.jpg", "images/b/dynamic_mask_a.png"),
     ],
 )
 def test_where_masks_are_found(listed: str, mask: str, tmp_path: Path) -> None:
@@ -204,6 +205,24 @@ def test_masks_that_no_image_has_are_said(tmp_path: Path, capsys: pytest.Capture
     iio.imwrite(tmp_path / "masks" / NAMES[0], half_mask())
     read(tmp_path)
     assert not capsys.readouterr().err
+
+
+def test_a_blender_scenes_masks_that_no_image_has_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_blender(tmp_path)
+    (tmp_path / "masks").mkdir()
+    iio.imwrite(tmp_path / "masks" / "of nothing.png", half_mask())
+    read(tmp_path)
+    assert "has 1 files, 'of nothing.png' for one" in capsys.readouterr().err
+
+
+def test_instant_ngps_masks_are_white_where_nothing_is_trained_on(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    for name in NAMES:
+        iio.imwrite(tmp_path / "images" / f"dynamic_mask_{Path(name).stem}.png", half_mask())
+    masks = read(tmp_path).masks
+    assert masks is not None
+    np.testing.assert_array_equal(masks[0], half_mask() == 0)
+    np.testing.assert_array_equal(read(tmp_path, masks="object").images[0][..., 3], 255 - half_mask())
 
 
 def test_masks_that_leave_no_object_are_an_error(tmp_path: Path) -> None:

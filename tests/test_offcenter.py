@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,31 @@ class TestPixels:
         line = refusal(tmp_path / "scene", tmp_path / "out")
         assert re.search(rf"transforms_{split}.json: frames\[1\].file_path: '.*1.png' does not exist", line)
         assert not capsys.readouterr().err
+
+    def test_a_training_split_without_any_image_is_refused_and_another_is_said(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        doc = write_scene(tmp_path / "scene")
+        write_json(tmp_path / "scene", doc, "test")
+        elsewhere = deepcopy(doc)
+        for frame in elsewhere["frames"]:
+            frame["file_path"] = f"elsewhere/{frame['file_path']}"
+        write_json(tmp_path / "scene", elsewhere)
+        assert re.search(r"train.json: frames\[0\].* does not exist", refusal(tmp_path / "scene", tmp_path / "out"))
+        write_json(tmp_path / "scene", doc)
+        write_json(tmp_path / "scene", elsewhere, "val")
+        offcenter(tmp_path / "scene", tmp_path / "out", SHIFT)
+        assert not (tmp_path / "out" / "shifted" / "transforms_val.json").exists()
+        assert "transforms_val.json: none of its images exists: left out" in capsys.readouterr().err
+
+    def test_paths_written_on_windows(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        for frame in doc["frames"]:
+            frame["file_path"] = frame["file_path"].removeprefix("./").replace("/", "\\")
+        write_json(tmp_path / "scene", doc)
+        for copy, _ in copies_of(tmp_path / "scene"):
+            assert sorted(path.name for path in copy.iterdir()) == ["train", "transforms_train.json"]
+            assert len(read_blender(copy, "train").images) == len(doc["frames"])
 
     def test_masks_hide_the_padding(self, tmp_path: Path) -> None:
         doc = write_scene(tmp_path / "scene")

@@ -53,7 +53,7 @@ def test_a_named_target_that_does_not_exist() -> None:
 @pytest.mark.parametrize("config", [ForeignConfig(), EdgeSEPixelSamplerConfig()])
 def test_the_hosts_arguments_override_the_config(config: PixelSamplerConfig) -> None:
     sampler = config.setup(num_rays_per_batch=33, keep_full_image=True)
-    assert sampler.num_rays_per_batch == 33
+    assert sampler.num_rays_per_batch == sampler.config.num_rays_per_batch == 33
     assert sampler.config.keep_full_image
     sampler.set_num_rays_per_batch(4)
     assert sampler.num_rays_per_batch == 4

@@ -100,6 +100,8 @@ def test_a_checkpoint_of_another_grid_or_weights(attack: str, lean: Path, refuse
 
 TRAININGS = {
     "moments of another shape": lambda state: state["optimizer"]["state"][0].update(exp_avg=torch.zeros(1)),
+    "moments that show one number again": lambda state: again(state["optimizer"]["state"][0], "exp_avg"),
+    "squares that show one number again": lambda state: again(state["optimizer"]["state"][0], "exp_avg_sq"),
     "moments of a step below 0": lambda state: state["optimizer"]["state"][0]["step"].fill_(-1),
     "moments of an unknown weight": lambda state: state["optimizer"]["state"].update({99: {}}),
     "an optimizer of other settings": lambda state: state["optimizer"]["param_groups"][0].update(capturable=True),
@@ -119,6 +121,11 @@ TRAININGS = {
 }
 
 
+def again(moments: dict, name: str) -> None:
+    """The right shape, in a storage that is large enough, of which one number is shown."""
+    moments[name] = torch.zeros(moments[name].numel())[-1:].expand(moments[name].shape)
+
+
 def errors_of(state: dict) -> dict:
     return state["sampler"]["se.selector"]
 
@@ -127,6 +134,22 @@ def errors_of(state: dict) -> dict:
 def test_a_checkpoint_of_another_training(attack: str, nerf: Path, refused: Callable) -> None:
     change_state(nerf, TRAININGS[attack])
     refused("resume", nerf)
+
+
+@pytest.mark.parametrize("kind", ["nerf", "lean"])
+def test_one_moment_for_a_row_of_a_network(kind: str, request: pytest.FixtureRequest, edge_se: Callable) -> None:
+    """As tables of sparse gradients have it; torch's fused step would write behind it."""
+    run: Path = request.getfixturevalue(kind)
+
+    def shorten(state: dict) -> None:
+        moments = state["optimizer"]["state"][0]
+        moments["exp_avg_sq"] = moments["exp_avg_sq"][:, :1].clone()
+
+    change_state(run, shorten)
+    answer = edge_se("resume", run, "--max-num-iterations", 9)
+    assert answer.code == 2, answer
+    assert "optimizer" in answer.err
+    assert answer.err.count("\n") == 1
 
 
 class Zeros:

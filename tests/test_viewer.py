@@ -258,6 +258,18 @@ def test_a_single_camera_looks_at_what_is_halfway_between_near_and_far() -> None
     assert (camera.near, camera.far) == pytest.approx((0.01 * scale, 100 * scale))
 
 
+def test_a_camera_far_from_all_others_does_not_move_the_point_to_begin_at() -> None:
+    viewed = Viewed(tiny_trainer(config_of(1), VIEWS))
+    camera = SimpleNamespace()
+    server: Any = SimpleNamespace(scene=SimpleNamespace(set_up_direction=lambda _: None), initial_camera=camera)
+    poses = viewed.trainer.pipeline.datamanager.cameras.camera_to_worlds
+    poses[0, :, 3] = 1000.0
+    focus, _ = html.set_initial_camera(server, viewed)
+    expected, _ = find_focus(viewed.cameras[list(range(1, len(poses)))].to("cpu", torch.float64))
+    np.testing.assert_allclose(focus, expected)
+    np.testing.assert_allclose(camera.position, poses[1, :, 3], rtol=1e-6)
+
+
 def test_an_html_file_begins_behind_the_cameras_that_turn(
     viewed: Viewed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

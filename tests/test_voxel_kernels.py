@@ -228,6 +228,20 @@ def test_a_step_of_adam_moves_the_rows_of_the_gradient_alone(ops: ModuleType) ->
         expected = values.double().clone()
 
 
+@pytest.mark.parametrize("width", [1, 8, 24])
+def test_rows_of_any_width_are_stepped_as_by_the_reference(width: int) -> None:
+    rows, sums = torch.tensor([[70, 3, 127]]), random_tensor(3, width)
+    gradient = torch.sparse_coo_tensor(rows, sums, (128, width), check_invariants=True)
+    found = []
+    for ops in (voxel_kernels, voxel_ops):
+        values, mean, square = random_tensor(128, width), torch.zeros(128, width), torch.zeros(128, 1)
+        settings = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-8, "maximum": 1.0, "total_variation": 0.5}
+        ops.adam_rows(values, mean, square, gradient, **settings)
+        found.append((values, mean, square))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other)
+
+
 @pytest.mark.parametrize("ratio", [0.3, 0.5, 0.8])
 @pytest.mark.parametrize("ops", [voxel_kernels, voxel_ops])
 def test_finer_corners_have_the_values_around_them(ops: ModuleType, ratio: float) -> None:

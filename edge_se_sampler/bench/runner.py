@@ -162,12 +162,14 @@ def _run_trials(
     command, and stops no other."""
     with Progress(len(trials), experiment.name, start=len(trials) - len(pending(trials, result))) as progress:
         for _ in range(MAX_BROKEN_POOLS):
+            # scenes are rendered and copied here, which takes time: before anything is trained that could be lost
+            jobs = [(trial, experiment.arguments(trial)) for trial in pending(trials, result)]
             with new_executor() as executor:
                 trial_of: dict[Future[Run], Any] = {}
                 try:
                     with interrupts_delayed(), interrupts_blocked():
-                        for trial in pending(trials, result):
-                            trial_of[executor.submit(experiment.train, trial, *experiment.arguments(trial))] = trial
+                        for trial, arguments in jobs:
+                            trial_of[executor.submit(experiment.train, trial, *arguments)] = trial
                     for future in as_completed(trial_of):
                         _store(result, trial_of.pop(future), future)
                         write_result(path, result)

@@ -12,6 +12,7 @@ import numpy as np
 
 from edge_se_sampler.data.capture import SPLITS, Split, keep_existing
 from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, check_scene, load_views
+from edge_se_sampler.data.mask_files import describe_unused_masks
 from edge_se_sampler.data.scene_file import JsonValue, SourceFile, SourceLocation, check_folder, quote, read_json
 from edge_se_sampler.data.transforms_frames import read_entries, read_frames
 from edge_se_sampler.data.views import NERF_SYNTHETIC_DEPTHS, NERF_SYNTHETIC_DISTANCES, Views
@@ -55,6 +56,8 @@ def read_blender(
     depths = NERF_SYNTHETIC_DEPTHS if _is_of_nerf(top, frames) else None
     if split == "train":
         check_scene(frames)
+        for line in describe_unused_masks(Path(folder), frames):
+            print(line, file=sys.stderr)
     views = load_views(settings.choose(frames), settings, progress)
     return replace(views, depths=depths, data_format="blender")
 
@@ -101,4 +104,6 @@ def _check_split(folder: Path, split: str) -> None:
     found = ", ".join(transforms_path(folder, other).name for other in SPLITS if has_split(folder, other))
     others = f"only {found}" if found else "nor that of any other split"
     hint = "a Blender scene has transforms_train.json and, for other splits, transforms_val.json, transforms_test.json"
+    if (folder / "transforms.json").exists():
+        hint = "to train on its transforms.json add --data-format transforms"
     raise SourceLocation(folder).error(f"has no transforms_{split}.json, {others}", hint)

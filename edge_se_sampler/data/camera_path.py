@@ -53,20 +53,30 @@ def undo_dataparser(path: CameraPath, transforms: Path, data: Path, data_format:
     s (R x + t) in nerfstudio, by a run's dataparser_transforms.json. InputError for files that cannot be used."""
     top, hint = read_json(transforms), "give the dataparser_transforms.json in the folder of nerfstudio's run"
     motion, scale = _read_motion(top.required("transform", hint)), top.required("scale", hint).positive_number()
-    if find_format(data, data_format) == "transforms":  # whose own transform the file takes together with this one
-        scene = read_json(transforms_path(data))
-        applied, applied_scale = scene.optional("applied_transform"), scene.optional("applied_scale")
-        if applied is not None:
-            motion = motion @ np.linalg.inv(_read_motion(applied))
-        elif (data / "colmap" / "sparse" / "0").exists():
-            motion = motion @ np.linalg.inv((*OLD_COLMAP_TRANSFORM, (0, 0, 0, 1)))
-        scale /= 1.0 if applied_scale is None else applied_scale.positive_number()
+    applied, applied_scale = read_applied(data, data_format)  # which the file takes together with its own
+    motion, scale = motion @ np.linalg.inv(applied), scale / applied_scale
     poses = path.cameras.camera_to_worlds.numpy().copy()
     with np.errstate(over="ignore"):  # infinite positions are refused below
         poses[:, :, 3] = poses[:, :, 3] / scale - motion[:3, 3]
     _check_positions(poses, top.location)
     poses = path.cameras.camera_to_worlds.new_tensor(motion[:3, :3].T @ poses)
     return replace(path, cameras=replace(path.cameras, camera_to_worlds=poses))
+
+
+def read_applied(data: Path, data_format: DataFormat) -> tuple[np.ndarray, float]:
+    """The motion (4, 4) and the scale by which nerfstudio takes the world of a scene's cameras to be another than that
+    of what they were made from, such as COLMAP's: neither, but where a transforms.json says so. InputError for a json
+    that cannot be used."""
+    motion, scale = np.eye(4), 1.0
+    if find_format(data, data_format) == "transforms":
+        scene = read_json(transforms_path(data))
+        if (applied := scene.optional("applied_transform")) is not None:
+            motion = _read_motion(applied)
+        elif (data / "colmap" / "sparse" / "0").exists():
+            motion = np.array((*OLD_COLMAP_TRANSFORM, (0, 0, 0, 1)), dtype=np.float64)
+        if (applied_scale := scene.optional("applied_scale")) is not None:
+            scale = applied_scale.positive_number()
+    return motion, scale
 
 
 def _check_positions(poses: np.ndarray, location: SourceLocation) -> None:

@@ -5,6 +5,7 @@ No image but those at work is in memory at its full size.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,8 @@ Progress = Callable[[int, int], None]
 Select = Callable[[int], Sequence[int] | None]
 """Of so many views the indices of some, in an order; None: all."""
 T = TypeVar("T")
+DYNAMIC_MASK = "dynamic_mask_"
+"""How the names of instant-ngp's masks begin."""
 MAX_MISFIT = 2**22
 """Pixels of a mask of another size than its image, up to which it is decoded: it may be damaged, too."""
 MAX_REMAPPED = 2**15 - 2
@@ -242,7 +245,8 @@ def _load_frame(frame: Frame, settings: LoadSettings) -> tuple[np.ndarray, np.nd
 def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8: the largest color of the pixels of an image's mask or, where that is the same everywhere, their
     alpha; 255 in place of the one number that a mask may have beside 0. A JPEG's, in which black need not be 0, is 0
-    or 255, whichever half it is in. It is turned as its own orientation says if that gives it the image's size."""
+    or 255, whichever half it is in. It is turned as its own orientation says if that gives it the image's size. One of
+    instant-ngp's, by its name, says what is not to be trained on: its black is 255, all else 0."""
     height, width = size = image.shape[:2]
     header = choose_orientation(
         file, read_header(file), lambda header: (header.width, header.height) == (width, height)
@@ -257,6 +261,8 @@ def read_mask(file: SourceFile, image: np.ndarray) -> np.ndarray:
                 values = pixels[..., 3]
             if header.is_lossy:
                 values = values & np.uint8(128)
+            if os.path.basename(file.name).startswith(DYNAMIC_MASK):
+                return np.where(values > 0, np.uint8(0), np.uint8(255))
             is_binary = ((values == 0) | (values == values.max())).all()
             return np.where(values > 0, np.uint8(255), np.uint8(0)) if is_binary else values
     problem = f"is {found[1]} x {found[0]} pixels, its image {width} x {height}"

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from edge_se_sampler.data.frames import Frame
+from edge_se_sampler.data.frames import DYNAMIC_MASK, Frame
 from edge_se_sampler.data.scene_file import SourceFile, locate_file, quote
 
 
@@ -26,7 +26,8 @@ def place_of_mask(folder: Path, image: Path) -> Path:
 def find_mask(folder: Path, listed: str, image: SourceFile) -> SourceFile | None:
     """The mask of an image, listed under a path in the folder, for which the scene lists none: named as the image or,
     if that is a link, as its file, with .png added or in place of the suffix, or alike; or so with _mask behind the
-    name, as Metashape writes them. None: there is none either. InputError if it lies outside the folder."""
+    name, as Metashape writes them; or instant-ngp's, beside the image, with dynamic_mask_ before the name. None: there
+    is none either. InputError if it lies outside the folder."""
     place = next((place for place in _places(folder, listed, image) if os.path.isfile(folder / place)), None)
     return None if place is None else locate_file(folder, str(place), image.location)
 
@@ -43,6 +44,7 @@ def _places(folder: Path, listed: str, image: SourceFile) -> Iterator[Path]:
             place = Path(masks, *parts)
             yield from (place.with_name(f"{place.name}.png"), place.with_suffix(".png"), place)
             yield from (place.with_name(f"{place.stem}_mask{suffix}") for suffix in (".png", place.suffix))
+        yield path.with_name(f"{DYNAMIC_MASK}{path.stem}.png")
 
 
 def describe_unused_masks(folder: Path, frames: Sequence[Frame]) -> list[str]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,12 +25,12 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.blender import has_views, read_blender, transforms_path
+from edge_se_sampler.data.blender import has_split, has_views, read_blender, transforms_path
 from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.frames import read_mask
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
-from edge_se_sampler.data.transforms_frames import Entry, listed_file, read_entries, read_lens
+from edge_se_sampler.data.transforms_frames import Entry, listed_file, read_entries, read_lens, read_path
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.errors import InputError
 
@@ -144,7 +145,12 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
     written: dict[str, tuple[str, str]] = {}
     cut_off: list[tuple[Entry, int]] = []
     needed = np.zeros(2)  # padding, over all views
-    found: tuple[Split, ...] = tuple(split for split in SPLITS if has_views(data, split))
+    found: list[Split] = []
+    for split in SPLITS:
+        if has_views(data, split) or (split == "train" and has_split(data, split)):
+            found.append(split)
+        elif has_split(data, split):
+            print(f"{transforms_path(data, split)}: none of its images exists: left out", file=sys.stderr)
     if not found:
         read_blender(data, "train")  # says that there is none
     for split in found:
@@ -183,7 +189,7 @@ def _output_files(data: Path, frame: JsonValue, entry: Entry, written: dict[str,
     files = {}
     for key in ("file_path", "mask_path"):
         if value := frame.optional(key):
-            listed = listed_file(value.value)
+            listed = listed_file(read_path(value, data))
             stem, suffix = os.path.splitext(Path(os.path.normpath(listed)).as_posix())
             file = stem + (suffix if suffix.lower() == ".png" else ".png")
             if file.startswith("../"):  # and in again: the loader does not mind, but we write there

@@ -13,9 +13,6 @@ from edge_se_sampler.data.capture import SPLITS, Capture, Split, keep_existing
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
 from edge_se_sampler.data.transforms_frames import Entry, listed_file, read_entries, read_frames
 
-UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
-"""Keys by which instant-ngp's json says that a camera is no perspective one."""
-
 
 def transforms_path(folder: Path) -> Path:
     return folder / "transforms.json"
@@ -25,9 +22,6 @@ def read_transforms(folder: Path) -> Capture:
     """The frames of a folder whose images exist, in the order of their names, and how they are split if the json says
     so. InputError for a json that cannot be used, and where fewer than half of the images exist."""
     top = read_json(transforms_path(folder))
-    for key in UNSUPPORTED:
-        if (value := top.optional(key)) is not None and value.value not in (False, None):
-            raise value.location.error("is of a camera that is not supported", "make perspective images of it")
     listed = read_entries(top, folder)
     splits = _read_splits(top, listed)
     entries, left_out = keep_existing(listed, [entry.image for entry in listed], top.required("frames", "").location)

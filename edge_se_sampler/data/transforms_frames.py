@@ -37,7 +37,10 @@ _INTRINSICS = {
     **dict.fromkeys(_DISTORTION, JsonValue.number),
     "camera_model": lambda value: _read_model(value),
     "is_fisheye": lambda value: _read_flag(value),
+    "fisheye_crop_radius": JsonValue.positive_number,
 }
+_UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
+# keys by which instant-ngp's json says that a camera is no perspective one
 _MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -105,7 +108,7 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
     own = _read_intrinsics(entry)
     # an angle of the frame's own says more than a focal length of the file's
     shared = {key: value for key, value in shared.items() if key.replace("fl_", "camera_angle_") not in own}
-    path = _read_path(file_path, folder)
+    path = read_path(file_path, folder)
     image = _locate(path, folder, file_path.location)
     return Entry(
         location=entry.location,
@@ -113,14 +116,21 @@ def _read_entry(entry: JsonValue, shared: dict[str, JsonValue], folder: Path) ->
         image=image,
         mask=find_mask(folder, image.name, image)
         if mask_path is None
-        else _locate(_read_path(mask_path, folder), folder, mask_path.location),
+        else _locate(read_path(mask_path, folder), folder, mask_path.location),
         pose=_read_pose(entry.required("transform_matrix", "write the 4x4 camera-to-world matrix")),
         intrinsics=shared | own,
     )
 
 
 def _read_intrinsics(parent: JsonValue) -> dict[str, JsonValue]:
+    for key in _UNSUPPORTED:
+        if (value := parent.optional(key)) and value.value is not None and value.value is not False:
+            raise value.location.error("is of a camera that is not supported", "make perspective images of it")
     stated = {key: value for key in _INTRINSICS if (value := parent.optional(key))}
+    if (value := parent.optional("distortion_params")) is not None:  # which count before others in nerfstudio, too
+        if len(value.list()) != len(_DISTORTION):
+            raise value.location.error(f"has {len(value.list())} numbers", f"write {', '.join(_DISTORTION)}")
+        stated |= dict(zip(_DISTORTION, value.list(), strict=True))
     for key in stated.keys() & _DISTORTION:  # which nerfstudio writes in quotes for RealityCapture's cameras
         stated[key] = stated[key].unquoted()
     for key, value in stated.items():
@@ -173,7 +183,7 @@ def rigid_pose(matrix: JsonValue, entries: Sequence[JsonValue]) -> np.ndarray:
     return pose[:3]
 
 
-def _read_path(name: JsonValue, folder: Path) -> str:
+def read_path(name: JsonValue, folder: Path) -> str:
     """The path that `name` holds, which may have been written on Windows."""
     path = name.file_path()
     return path if os.path.exists(folder / listed_file(path)) else path.replace("\\", "/")
@@ -216,6 +226,9 @@ def read_lens(known: dict[str, JsonValue]) -> Lens | None:
     k1, k2, k3, k4, p1, p2 = (known.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model, flag = known.get("camera_model"), known.get("is_fisheye")
     fisheye = (model is not None and model.value == "OPENCV_FISHEYE") or (flag is not None and flag.value)
+    if fisheye and "fisheye_crop_radius" in known:
+        problem, hint = "is not supported", "leave it out, and give masks that are black beyond it"
+        raise known["fisheye_crop_radius"].location.error(problem, hint)
     for coefficient in (p1, p2) if fisheye else (k4,):
         if coefficient is not None and coefficient.number() != 0:
             kind = "a fisheye" if fisheye else "a lens that is none"

@@ -181,6 +181,7 @@ class TrainerConfig(InstantiateConfig):
             return
         if self.reinit_dead:
             raise InputError("--reinit-dead: this model's density is never 0, it cannot die; leave the flag out")
+        check_value("optimizer.eps", optimizer.eps, optimizer.eps > 0, f"above 0 for {self.method_name}")
         if getattr(manager.pixel_sampler, "error_source", "fine") == "coarse":
             flag = "--pipeline.datamanager.pixel-sampler.error-source"
             raise InputError(f"{flag} is coarse: this model has no coarse network")

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from edge_se_sampler.engine.config import OptimizerConfig
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import SizePreset
 from edge_se_sampler.models.ray_model import ParameterGroup
 from edge_se_sampler.models.voxel_backend import choose_ops
@@ -30,10 +31,23 @@ class RowAdam(torch.optim.Adam):
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         for group in self.param_groups:
             for weight in group["params"]:
-                if weight.grad is not None and weight.grad.is_sparse:
+                if weight.grad is None:
+                    continue
+                self._check_state(weight)
+                if weight.grad.is_sparse:
                     self._step_rows(group, weight)
                     weight.grad = None
         return super().step(closure)
+
+    def _check_state(self, weight: torch.Tensor) -> None:
+        """InputError if a checkpoint's running mean of squares has another shape than a weight's gradient needs:
+        compiled and fused steps would not find out."""
+        assert weight.grad is not None
+        shape = weight[:, :1].shape if weight.grad.is_sparse else weight.shape
+        square = self.state.get(weight, {}).get("exp_avg_sq")
+        if square is not None and square.shape != shape:
+            problem = "the checkpoint's optimizer is not of a training by this run's config.json"
+            raise InputError(f"{problem}; begin a new training")
 
     def _step_rows(self, group: dict[str, Any], weight: torch.Tensor) -> None:
         state, interval = self.state[weight], TOTAL_VARIATION_INTERVAL

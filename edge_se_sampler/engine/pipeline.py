@@ -42,18 +42,26 @@ class Pipeline:
     """The cells with which training begins; None: the model has no grid."""
 
     @classmethod
-    def build(cls, config: TrainerConfig, views: Views, device: str, saved_grid: BrickGrid | None = None) -> Pipeline:
+    def build(
+        cls,
+        config: TrainerConfig,
+        views: Views,
+        device: str,
+        saved_grid: BrickGrid | None = None,
+        *,
+        changed_data: bool = False,
+    ) -> Pipeline:
         """Set up both for a resolved config; on the occupancy grid of a checkpoint, else on the scene's own. InputError
-        if the checkpoint's grid is another scene's."""
+        if the checkpoint's grid is another scene's, unless that is accepted."""
         model_config, manager_config = config.pipeline.model, config.pipeline.datamanager
         grid, hull, has_masks, summary, digest = saved_grid, None, False, views.describe(), views.digest()
         if model_config.needs_grid:
             analysis = analyze_views(views, model_config)
             grid, hull = analysis.grid(), analysis.hull
             has_masks = analysis.num_silhouettes > 0
-            if saved_grid is not None and not saved_grid.is_of_the_same_scene(grid):
+            if saved_grid is not None and not (changed_data or saved_grid.is_of_the_same_scene(grid)):
                 changed = "its images, masks or cameras have changed since, or this machine rounds differently"
-                remedy = "restore the data, or begin a new training"
+                remedy = "restore the data, or go on in these cells by --changed-data True"
                 raise InputError(f"the scene's cells are not the checkpoint's: {changed}; {remedy}")
             if manager_config.skip_empty_rays and has_masks:
                 views = views.with_masks(analysis.hit_pixels)

@@ -44,7 +44,7 @@ class RunFolder:
                 (run.path / "checkpoints").mkdir()
                 (run.path / "previews").mkdir()
                 run.write_config(config)
-            except (OSError, InputError):
+            except BaseException:
                 shutil.rmtree(run.path, ignore_errors=True)
                 raise
         return run
@@ -175,7 +175,9 @@ def _checked_line(line: dict[str, Any]) -> str:
 
 
 def config_to_json(config: TrainerConfig) -> dict[str, Any]:
-    return json.loads(json.dumps(dataclasses.asdict(config), default=os.fspath))
+    """Its settings; not fields with an underscore, such as the `_target` of a pixel sampler of nerfstudio's."""
+    settings = dataclasses.asdict(config, dict_factory=lambda items: {k: v for k, v in items if k[0] != "_"})
+    return json.loads(json.dumps(settings, default=os.fspath))
 
 
 def config_digest(config: TrainerConfig) -> str:
@@ -203,7 +205,8 @@ def _drop_added_defaults(config: Any, values: dict[str, Any]) -> None:
 def config_from_json(default: Any, values: Any, where: str) -> Any:
     """The config that `config_to_json` turned into values; InputError if fields are missing, unknown or mistyped.
     Fields that were added later may be missing: they have their defaults."""
-    types, fields = get_type_hints(type(default)), dataclasses.fields(default)
+    types = get_type_hints(type(default))
+    fields = [field for field in dataclasses.fields(default) if field.name[0] != "_"]
     hints = {field.name: types[field.name] for field in fields}
     if isinstance(values, dict):
         values = {f.name: f.default for f in fields if f.metadata.get("added_later")} | values

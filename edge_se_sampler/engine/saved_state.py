@@ -187,6 +187,8 @@ def _are_moments(moments: Any, weight: Tensor) -> bool:
         all(isinstance(value, Tensor) and value.is_floating_point() for value in (mean, square, steps))
         and mean.shape == weight.shape
         and square.shape in shapes
+        and mean.is_contiguous()
+        and square.is_contiguous()  # torch's fused Adam takes that for granted
         and steps.shape == ()
         and 0 <= float(steps) < MAX_STEP
     )

@@ -39,9 +39,14 @@ from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.settings import SamplingSettings
 
 
-def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None) -> Trainer:
+def prepare(
+    config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid | None = None, *, changed_data: bool = False
+) -> Trainer:
     """Read the data, resolve the config, and set up a trainer; InputError, and nothing written, if they are bad.
-    A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one."""
+    A run that is continued comes with its folder, and with its checkpoint's occupancy grid if it has one, which may be
+    of other data if that is accepted."""
+    if run is None and config.time_budget is not None and config.segments is not None:
+        raise InputError("--time-budget and --segments: give one of them; segments repeat what a budget came out as")
     device = choose_device(config.machine.device_type, of_run=run is not None)
     ranks.join(device)
     views = read_train_views(config)
@@ -57,7 +62,7 @@ def prepare(config: TrainerConfig, run: RunFolder | None = None, grid: BrickGrid
     else:
         disable_malloc_trimming()
     began = time.monotonic()
-    pipeline = Pipeline.build(config, views, device, grid)
+    pipeline = Pipeline.build(config, views, device, grid, changed_data=changed_data)
     run = run or ranks.share(lambda: RunFolder.create(config))
     setup_seconds += time.monotonic() - began
     if preview is not None and ranks.is_main():
@@ -117,7 +122,7 @@ def prepare_resume(
     check_run_data(config)
     if ranks.is_main():
         make_folder(run.path / "previews", "the run's")  # which git, for one, leaves out when it is empty
-    trainer = prepare(session_config, run, saved_grid(state["model"]))
+    trainer = prepare(session_config, run, saved_grid(state["model"]), changed_data=changed_data)
     trainer.resume(state, changed_data)
     if ranks.is_main():
         run.write_config(config)
@@ -228,7 +233,9 @@ def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> in
     """Bytes that training takes beside images whose longest side has so many pixels; 0: it takes a GPU's own."""
     if choose_device(config.machine.device_type, of_run=True) == "cuda":
         return 0
-    return decide_size(config.pipeline.model, longest).training_memory(has_alpha)
+    model = decide_size(config.pipeline.model, longest)
+    rays = replace(config, pipeline=replace(config.pipeline, model=model)).preset.rays
+    return model.training_memory(has_alpha, rays)
 
 
 def _read_split(

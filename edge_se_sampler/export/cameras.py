@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from edge_se_sampler.data.blender import transforms_path as blender_path
+from edge_se_sampler.data.camera_path import read_applied
 from edge_se_sampler.data.capture import SPLITS
 from edge_se_sampler.data.dataset import DataSettings, find_format, list_frames
-from edge_se_sampler.data.frames import Frame
+from edge_se_sampler.data.frames import DYNAMIC_MASK, Frame, read_mask
+from edge_se_sampler.data.scene_file import SourceFile
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, write_image, write_json
+from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
 from edge_se_sampler.engine.session import check_run_data, select_views
 from edge_se_sampler.errors import InputError
 
@@ -23,8 +26,8 @@ POINTS_NAME = "points.ply"
 
 def export_cameras(config: TrainerConfig, path: Path) -> str:
     """Write the cameras of a run's data, of the images as they are in their files: at full size, with their lenses'
-    distortion. Which are trained on is listed, and which are held out. Returns a line about it; InputError if the data
-    or the file cannot be used."""
+    distortion. Which are trained on is listed, and which are held out; masks that nerfstudio would read otherwise are
+    written anew. Returns a line about it; InputError if the data or the file cannot be used."""
     check_output(path, ".json")
     check_run_data(config)
     assert config.data is not None  # or it would not be there
@@ -42,13 +45,23 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     splits["train"] = splits["train"] if selected is None else [splits["train"][i] for i in selected]
     # nerfstudio wants both
     splits["val"], splits["test"] = splits["val"] or splits["test"], splits["test"] or splits["val"]
-    frames = {frame.image.path: describe_frame(frame, path.parent) for split in SPLITS for frame in splits[split]}
+    listed = {frame.image.path: frame for split in SPLITS for frame in splits[split]}
+    frames = {image: describe_frame(frame, path.parent) for image, frame in listed.items()}
     masks = _mask_all(list(frames.values()), path.parent)
-    content = share_intrinsics(list(frames.values()))
+    num_written = _write_masks(listed, frames, path)
+    motion, scale = read_applied(config.data, config.data_format)
+    applied = {"applied_transform": motion[:3].tolist(), "applied_scale": scale}
+    content = applied | share_intrinsics(list(frames.values()))
     for split in SPLITS if splits["test"] else ():  # nerfstudio wants all lists or none
         content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
     line = f"{path}: {len(frames)} cameras, {len(splits['train'])} of them to train on"
     line += f"; masks beside it, in which all is known, for those without: {', '.join(masks)}" if masks else ""
+    if num_written:
+        line += f"; {num_written} masks written anew beside it, which nerfstudio would read otherwise"
+    if len({frame["camera_model"] for frame in frames.values()}) > 1:
+        line += "; nerfstudio takes all cameras for perspective ones, since fisheyes are among others"
+    if turned := sum(frame.header.orientation >= 5 for frame in listed.values()):
+        line += f"; nerfstudio does not turn images as their EXIF orientation says, as {turned} of these have to be"
     if (path.parent / POINTS_NAME).is_file():
         content["ply_file_path"] = POINTS_NAME
         line += f"; the {POINTS_NAME} that lies beside it is named as their points"
@@ -82,6 +95,32 @@ def _mask_all(frames: list[dict[str, Any]], folder: Path) -> list[str]:
         if not (folder / frame["mask_path"]).exists():
             write_image(folder / frame["mask_path"], np.full((frame["h"], frame["w"]), 255, np.uint8))
     return sorted({frame["mask_path"] for frame in without})
+
+
+def _write_masks(listed: dict[Path, Frame], entries: dict[Path, dict[str, Any]], path: Path) -> int:
+    """Write what is known as a gray PNG, into a folder beside the json, for frames whose mask is none, or says it
+    otherwise; returns how many."""
+    folder, count = path.parent / f"{path.stem}-masks", 0
+    for number, (image, frame) in enumerate(listed.items()):
+        if frame.mask is None or _is_plain(frame.mask):
+            continue
+        make_folder(folder, "the masks'")
+        mask = folder / f"{number:05}.png"
+        size = frame.header.height, frame.header.width
+        known = read_mask(frame.mask, np.broadcast_to(np.uint8(0), size)) > 0
+        write_image(mask, np.where(known, np.uint8(255), np.uint8(0)))
+        entries[image]["mask_path"], count = relative_path(mask, path.parent), count + 1
+    return count
+
+
+def _is_plain(mask: SourceFile) -> bool:
+    """Whether nerfstudio, which takes what is not 0 of a file's one channel, reads a mask as we do."""
+    try:
+        with Image.open(mask.path) as image:
+            gray = image.format == "PNG" and image.mode in ("1", "L")
+    except OSError:  # reading it says what is wrong
+        return False
+    return gray and not os.path.basename(mask.name).startswith(DYNAMIC_MASK)
 
 
 def relative_path(file: Path, folder: Path) -> str:

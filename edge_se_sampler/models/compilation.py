@@ -40,8 +40,8 @@ def _call_all(ops: ModuleType) -> None:
     ray = RayBundle(torch.full((1, 3), 0.1), torch.full((1, 3), 3**-0.5), torch.zeros((1, 1), dtype=torch.int64), norm)
     loss, _ = model.training_loss(ray, {"image": torch.ones(1, 4)})
     loss.sum().backward()
-    for weight in (model.density, model.features):
-        rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": 1.0}
+    for weight, total_variation in ((model.density, 0.0), (model.features, 1.0)):
+        rows = {"lr": 0.1, "betas": (0.9, 0.99), "eps": 1e-15, "maximum": 5.0, "total_variation": total_variation}
         ops.adam_rows(weight, torch.zeros_like(weight), torch.zeros_like(weight[:, :1]), weight.grad, **rows)
         ops.find_dense_cells(grid, weight.data, 0.0)
         ops.resample(subdivide(grid, cells, 0.5).bricks, 0.5, grid.numbers, weight.data)

@@ -17,6 +17,8 @@ MAX_SAMPLES, MAX_RAYS = 2**14, 2**24
 """Of a ray along it, and rays of a step: more would be a mistake, or a stranger's."""
 BYTES_PER_RAY = 2**15
 """Of the lean model's samples on a ray of a training step."""
+RAYS_PER_CHUNK = 2**16
+"""Rays that it looks at at once."""
 GIB_PER_PIXEL = 1 / 400
 """Memory of the lean model's cells, by the longest side of the images."""
 MAX_MEMORY = 2**20
@@ -107,8 +109,9 @@ class ModelConfig(InstantiateConfig, ABC):
         return True
 
     @abstractmethod
-    def training_memory(self, has_alpha: bool) -> int:
-        """Bytes that training takes at most on a CPU, beside images, which have alpha or not; the size is decided."""
+    def training_memory(self, has_alpha: bool, rays: int) -> int:
+        """Bytes that training with so many rays a step takes at most on a CPU, beside images, which have alpha or not;
+        the size is decided."""
 
     def check(self, prefix: str = "") -> None:
         """Raise InputError, with flags' names of this prefix, if a value is out of its range; the size is decided."""
@@ -156,7 +159,7 @@ class NeRFModelConfig(ModelConfig):
     def culls_by_alpha(self) -> bool:
         return self.empty_space_skipping
 
-    def training_memory(self, has_alpha: bool) -> int:
+    def training_memory(self, has_alpha: bool, rays: int) -> int:
         """Of two networks the weights, their gradients and Adam's two means; of a chunk's points what each layer
         returns, and its gradient."""
         preset = self.preset
@@ -228,13 +231,13 @@ class LeanModelConfig(ModelConfig):
     def culls_by_alpha(self) -> bool:
         return self.cull_by_alpha
 
-    def training_memory(self, has_alpha: bool) -> int:
+    def training_memory(self, has_alpha: bool, rays: int) -> int:
         """The rows of cells and their corners, and the samples of a step's rays; the box that holds them, most of it
         empty, takes as much again where no hull makes it small."""
         assert self.max_memory is not None
         valid = 0 < self.max_memory <= MAX_MEMORY  # what is not, is refused later
         rows = int(self.max_memory * 2**30 if valid else 0)
-        return (rows if has_alpha and self.cull_by_alpha else 2 * rows) + BYTES_PER_RAY * self.preset.rays
+        return (rows if has_alpha and self.cull_by_alpha else 2 * rows) + BYTES_PER_RAY * min(rays, RAYS_PER_CHUNK)
 
     def check(self, prefix: str = "") -> None:
         super().check(prefix)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.models import voxel_ops
-from edge_se_sampler.models.config import LeanModelConfig
+from edge_se_sampler.models.config import RAYS_PER_CHUNK, LeanModelConfig
 from edge_se_sampler.models.levels import LAST_PRUNING, UNSETTLED, find_level, find_level_end
 from edge_se_sampler.models.ray_model import ParameterGroup, RayModel
 from edge_se_sampler.models.ray_spans import find_spans
@@ -34,12 +34,13 @@ from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttribute
 FEATURE_DIM, WIDTH = 16, 64
 """Features at a corner, and neurons of the hidden layer. The compiled kernels know no others."""
 INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
-"""The most at first, and at all: denser than that is as opaque, and slow to become transparent again."""
+"""The most at first, if that is sampled, and at all: denser is as opaque, and slow to become transparent again."""
 INITIAL_DEPTH, INITIAL_DEPTH_CARVED = 1.0, 8.5
 """Optical depth that the box would have at first, if cells filled it; the latter where masks carve them close to the
 object: more hides what is behind, and each view would learn a picture of its own on it."""
 SEEN_PER_ROW = 22
-"""How many weights will then be seen for each row that the finest level is expected to have."""
+"""How many weights must have been seen since the level settled, times how much longer training goes on, for each row
+that the finest level is expected to have."""
 SEEN_PER_CELL = 20
 """How many weights must have been seen for each cell before the finest are left out, or all of them, which is an
 error."""
@@ -53,9 +54,10 @@ FOG_MARGIN = 0.3
 TRANSPARENT_MARGIN = 0.7
 """How much less raw density than what is seen counts as transparent: until it is looked at again, it may grow."""
 ROWS_PER_SEEN, ROWS_PER_PIXEL = 0.2, 1.5
-"""Rows that there may be, once cells are smaller than was planned, for each weight that will be seen, and for each
-pixel of the training images that shows something: what is hardly seen is not learned any better in smaller cells, and
-with more numbers than there are in the images the model remembers rather than learns."""
+"""Rows that there may be, once cells are smaller than was planned, for each weight that was seen since the level
+settled, times how much longer training goes on, and for each pixel of the training images that shows something: what
+is hardly seen is not learned any better in smaller cells, and with more numbers than there are in the images the model
+remembers rather than learns."""
 MAX_RATIO = 0.85
 """Cells that would be larger than this part of the present ones are not worth subdividing."""
 MAX_STEPS = 2**24
@@ -101,7 +103,7 @@ class LeanModel(RayModel):
         depth = INITIAL_DEPTH_CARVED if grid.is_carved_close else INITIAL_DEPTH
         thin = math.log(depth / float(grid.size.max())) - int(grid.max_level) * math.log(2)
         # samples of less would be left out
-        raw = min(max(thin, self.marching.density_min + FOG_MARGIN), INITIAL_RAW_DENSITY)
+        raw = max(min(thin, INITIAL_RAW_DENSITY), self.marching.density_min + FOG_MARGIN)
         self.density = nn.Parameter(torch.full((grid.num_rows, 1), raw))
         # only a checkpoint has cells that were subdivided, and it has their features, which would take seconds to draw
         shape = grid.num_rows, FEATURE_DIM
@@ -128,9 +130,9 @@ class LeanModel(RayModel):
     def rays_per_chunk(self) -> int:
         """Fewer where plain torch, which looks at all steps of all rays at once, renders views: a pixel has up to 4."""
         if self.training or choose_ops(self.density) is not voxel_ops:
-            return 2**16
+            return RAYS_PER_CHUNK
         longest = math.hypot(*self.grid.size.tolist()) / self.config.step_size_voxels
-        return max(1, min(2**16, int(MAX_STEPS / (4 * longest))))
+        return max(1, min(RAYS_PER_CHUNK, int(MAX_STEPS / (4 * longest))))
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The network; density and features learn faster, for each sees few samples."""
@@ -273,7 +275,7 @@ class LeanModel(RayModel):
         False: they do not allow the finest level. Without it, this one ends later.
 
         Args:
-            remaining: how much longer than until now the training goes on.
+            remaining: how much longer than until now the training goes on, as a multiple of the time until now.
         """
         grid = self.grid
         finer = self._find_finer(grid.to_cells(seen), remaining)

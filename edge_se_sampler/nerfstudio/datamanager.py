@@ -26,6 +26,7 @@ from edge_se_sampler.nerfstudio.resume import (
     schedule_writer,
 )
 from edge_se_sampler.nerfstudio.scoring import get_background_color, observe_training_errors, ray_errors
+from edge_se_sampler.sampling.image_batch import ImageBatch
 from edge_se_sampler.sampling.pixel_sampler import build_scorer
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 from edge_se_sampler.sampling.settings import SamplingSettings
@@ -86,10 +87,11 @@ def attach(trainer: Any, **settings: Any) -> None:
     """
     manager = trainer.pipeline.datamanager
     if not isinstance(manager, VanillaDataManager):
-        raise InputError(
-            f"{type(manager).__name__} does not draw its pixels in this process: this sampler needs a "
-            "VanillaDataManager; set config.pipeline.datamanager to an EdgeSEDataManagerConfig instead of attaching"
-        )
+        problem, remedy = "draws no pixels", "methods that train on whole images have no use for this sampler"
+        if hasattr(manager, "train_pixel_sampler"):  # a ParallelDataManager
+            problem = "does not draw its pixels in this process"
+            remedy = "set config.pipeline.datamanager to an EdgeSEDataManagerConfig instead of attaching"
+        raise InputError(f"{type(manager).__name__} {problem}, and a VanillaDataManager is needed: {remedy}")
     sampler = manager.train_pixel_sampler
     if type(sampler) is not PixelSampler:
         raise InputError(f"the training sampler is a {type(sampler).__name__}: this sampler cannot replace it")
@@ -118,15 +120,23 @@ def _bind_sampler(manager: Any, trainer: Any) -> list[TrainingCallback]:
         write_schedule = schedule_writer(trainer, sampler.schedule)
         callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], write_schedule))
     if sampler.state_dict().keys() - {"schedule"}:
-        cameras = manager.train_dataset.cameras
-        sizes = torch.cat((cameras.height, cameras.width), dim=1).tolist()
-        restore_sampler(trainer, sampler, rank, {i: (rows, columns) for i, (rows, columns) in enumerate(sizes)})
+        restore_sampler(trainer, sampler, rank, _image_sizes(manager))
         write_sampler = sampler_writer(trainer, sampler, rank)
         callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], write_sampler))
     loader = manager.train_image_dataloader
     if loader.cache_all_images:
         sampler.check_images(loader.cached_collated_batch)
     return callbacks
+
+
+def _image_sizes(manager: Any) -> dict[int, tuple[int, int]]:
+    """Rows and columns of the training images by number: of its cameras, which nerfstudio may round otherwise, only
+    where images are not kept."""
+    loader, cameras = manager.train_image_dataloader, manager.train_dataset.cameras
+    if loader.cache_all_images:
+        return ImageBatch.of(loader.cached_collated_batch, use_mask=False).sizes_by_number
+    sizes = torch.cat((cameras.height, cameras.width), dim=1).tolist()
+    return {i: (rows, columns) for i, (rows, columns) in enumerate(sizes)}
 
 
 def _shared_settings(config: PixelSamplerConfig) -> dict[str, Any]:

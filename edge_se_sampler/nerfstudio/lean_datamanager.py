@@ -41,6 +41,8 @@ class LeanDataManager(EdgeSEDataManager):
             self.train_pixel_sampler = settings.setup(num_rays_per_batch=self.config.train_num_rays_per_batch)
             if self.train_image_dataloader.cache_all_images:
                 _add_masks(self.train_image_dataloader.cached_collated_batch, hit_pixels)
+            else:
+                self.train_dataset.hit_pixels = hit_pixels
         return super().get_training_callbacks(training_callback_attributes)
 
 

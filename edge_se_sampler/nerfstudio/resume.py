@@ -7,6 +7,7 @@ files must not lie among them: nerfstudio reads the name of every file there as 
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -18,13 +19,15 @@ import torch
 from edge_se_sampler.engine.files import write_atomically, write_json
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
-from edge_se_sampler.sampling.saved_sampler import is_sampler_state
+from edge_se_sampler.sampling.saved_sampler import is_alike, is_sampler_state
 from edge_se_sampler.sampling.schedule import AdaptiveSchedule
 
 PLAN_FILE = "edge-se-plan.json"
 SCHEDULE_FILE = "edge-se-schedule.json"
-SAMPLER_FILE = "edge-se-sampler-{rank}.pt"
-"""Of every process, of its last checkpoint: each has learnt from its own pixels."""
+SAMPLER_FILE = "edge-se-sampler-{rank}-{step}.pt"
+"""Of every process and checkpoint: each has learnt from its own pixels."""
+OLD_SAMPLER_FILE = "edge-se-sampler-{rank}.pt"
+"""The same in runs of earlier versions, of their last checkpoint."""
 
 
 def run_progress(trainer: Any) -> Callable[[int], float]:
@@ -48,17 +51,21 @@ def run_progress(trainer: Any) -> Callable[[int], float]:
 
 
 def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
-    """Load the state that the schedule had at the loaded checkpoint, if there is one. InputError: the file beside the
-    loaded checkpoint's folder holds no such state."""
-    loaded = _loaded_run(trainer)
-    if not loaded or not (path := loaded / SCHEDULE_FILE).exists():
+    """Load the state that the schedule had at the loaded checkpoint; a line if that is not known. InputError: the file
+    beside the loaded checkpoint's folder holds no such state."""
+    if not (loaded := _loaded_run(trainer)):
         return
+    path, step = loaded / SCHEDULE_FILE, trainer._start_step - 1
     try:
-        state = json.loads(path.read_text()).get(str(trainer._start_step - 1))
-        if state is not None:
-            schedule.load_state_dict(state)
-    except (OSError, ValueError, AttributeError, TypeError) as problem:
+        state = json.loads(path.read_text()).get(str(step)) if path.exists() else None
+        if state is not None and not is_alike(state, schedule.state_dict()):
+            raise ValueError(f"the state of step {step} is none")
+    except (OSError, ValueError, AttributeError) as problem:
         raise InputError(f"{path}: cannot be read ({problem!r}); delete it to begin with the early phase") from problem
+    if state is None:
+        print(f"edge-se-sampler: {path} has no state of step {step}: the early phase begins anew", file=sys.stderr)
+    else:
+        schedule.load_state_dict(state)
 
 
 def schedule_writer(trainer: Any, schedule: AdaptiveSchedule) -> Callable[..., None]:
@@ -80,7 +87,10 @@ def restore_sampler(trainer: Any, sampler: ImportantPixels, rank: int, images: d
     no such state."""
     if not (loaded := _loaded_run(trainer)):
         return
-    path, step = loaded / SAMPLER_FILE.format(rank=rank), trainer._start_step - 1
+    step = trainer._start_step - 1
+    path, old = (loaded / name.format(rank=rank, step=step) for name in (SAMPLER_FILE, OLD_SAMPLER_FILE))
+    if old.exists() and not path.exists():
+        path = old
     try:
         found: dict[str, Any] = torch.load(path, weights_only=True) if path.exists() else {"step": None}
         if found["step"] == step and not is_sampler_state(found["state"], sampler, images):
@@ -97,14 +107,20 @@ def restore_sampler(trainer: Any, sampler: ImportantPixels, rank: int, images: d
 
 def sampler_writer(trainer: Any, sampler: ImportantPixels, rank: int) -> Callable[..., None]:
     """A function to be called after each step: writes what the sampler has learnt whenever nerfstudio saves a
-    checkpoint, and raises InputError where it cannot."""
-    path = trainer.checkpoint_dir.parent / SAMPLER_FILE.format(rank=rank)
+    checkpoint, and raises InputError where it cannot. nerfstudio does so afterwards, and may be killed before: what
+    belongs to the checkpoint before is kept, too, and where it keeps all checkpoints, all is."""
+    folder, written = trainer.checkpoint_dir.parent, []
 
     def write_sampler(step: int) -> None:
-        if _is_saved(trainer, step):
-            state = {"step": step, "state": sampler.state_dict()}
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, lambda file: torch.save(state, file))
+        if not _is_saved(trainer, step):
+            return
+        content = io.BytesIO()
+        torch.save({"step": step, "state": sampler.state_dict()}, content)
+        folder.mkdir(parents=True, exist_ok=True)
+        written.append(folder / SAMPLER_FILE.format(rank=rank, step=step))
+        write_atomically(written[-1], content.getvalue())
+        if trainer.config.save_only_latest_checkpoint and len(written) > 2:
+            written.pop(0).unlink(missing_ok=True)
 
     return write_sampler
 
@@ -113,7 +129,8 @@ def _is_saved(trainer: Any, step: int) -> bool:
     """Whether nerfstudio saves a checkpoint after that step."""
     config, start = trainer.config, trainer._start_step
     last = {config.max_num_iterations - 1, start + config.max_num_iterations - 1}  # of nerfstudio's main, of 1.1.5
-    return step % config.steps_per_save == 0 or step in last
+    is_due = config.steps_per_save > 0 < step and step % config.steps_per_save == 0
+    return is_due or step in last
 
 
 def _loaded_run(trainer: Any) -> Path | None:

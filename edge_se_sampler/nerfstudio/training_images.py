@@ -33,6 +33,8 @@ class TrainingImages(InputDataset):
     def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0) -> None:
         super().__init__(replace(dataparser_outputs, alpha_color=None), scale_factor)
         self.mask_color = None  # it would be painted where nothing is trained on
+        self.hit_pixels: list[np.ndarray] | None = None
+        """(H, W) bool of each image: the pixels that are worth training on; others count as masked."""
         self._lenses = _read_lenses(self.cameras)
         sizes = zip(self.cameras.width.flatten().tolist(), self.cameras.height.flatten().tolist(), strict=True)
         pinholes = [find_pinhole(camera, *size) for camera, size in zip(self._lenses, sizes, strict=True)]
@@ -47,10 +49,11 @@ class TrainingImages(InputDataset):
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Any]:
         """The mask, if there is one, as a pinhole would have seen it: where all of a pixel may be trained on."""
-        if "mask" not in data:
-            return {}
-        mask = data["mask"][..., 0].numpy().astype(np.uint8) * 255
-        return {"mask": torch.from_numpy(self._undistort(mask, data["image_idx"]) == 255)[..., None]}
+        masks = [] if self.hit_pixels is None else [self.hit_pixels[data["image_idx"]]]
+        if "mask" in data:
+            mask = data["mask"][..., 0].numpy().astype(np.uint8) * 255
+            masks.append(self._undistort(mask, data["image_idx"]) == 255)
+        return {"mask": torch.from_numpy(np.all(masks, axis=0))[..., None]} if masks else {}
 
     def read_views(self) -> Views:
         """All images with what the scene's cells are derived from: cameras, masks, and points if the data parser has

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import viser
 
+from edge_se_sampler.data.cameras import find_far
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.trainer import Trainer
@@ -91,9 +92,12 @@ def start_server(address: ViewerConfig) -> Iterator[viser.ViserServer]:
 
 def set_initial_camera(server: viser.ViserServer, viewed: Viewed) -> tuple[np.ndarray, float]:
     """Begin at the first training camera, looking at what all of them look at; returns that point (3,), and how far it
-    is from them, world units."""
-    focus, depth = find_focus(viewed.cameras.to("cpu").to(dtype=torch.float64))
-    view, start = View.of_training(viewed.cameras, 0), server.initial_camera
+    is from them, world units. Cameras that are far from all others do not count."""
+    cameras = viewed.cameras.to("cpu").to(dtype=torch.float64)
+    far, _ = find_far(cameras.camera_to_worlds[:, :, 3].numpy())
+    cameras = cameras[np.flatnonzero(~far).tolist()]
+    focus, depth = find_focus(cameras)
+    view, start = View.of_training(cameras, 0), server.initial_camera
     if not depth.any():  # all look the same way: at what is halfway between near and far
         depth = np.full(len(depth), sum(viewed.trainer.config.pipeline.model.depths) / 2)
         focus = view.pose[:, 3] - depth[0] * view.pose[:, 2]

@@ -74,7 +74,8 @@ class Viewed:
         newest = latest_checkpoint(run.checkpoints)
         _, state = load_state(run, config)
         device, views = choose_device(config.machine.device_type, of_run=True), read_train_views(config, trains=False)
-        pipeline = Pipeline.build(config, views, device, saved_grid(state["model"]))
+        grid = saved_grid(state["model"])
+        pipeline = Pipeline.build(config, views, device, grid, changed_data=True)  # which rendering does not mind
         load_weights(pipeline.model, state["model"])
         viewed = cls(config.setup(run=run, pipeline=pipeline, preview=None))
         viewed._take(state, pipeline.model)

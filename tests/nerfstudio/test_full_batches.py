@@ -171,6 +171,11 @@ def test_attaching_where_pixels_are_drawn_by_others_is_refused(host_scene: Path,
     class Parallel:
         """Stands for ParallelDataManager, which would start processes."""
 
+        train_pixel_sampler = None
+
+    class Whole:
+        """Stands for FullImageDatamanager, Gaussian splatting's."""
+
     trainer = trainer_of(config_of("vanilla-nerf", host_scene, tmp_path))
     manager = trainer.pipeline.datamanager
     manager.train_pixel_sampler = PairPixelSamplerConfig().setup(num_rays_per_batch=8)
@@ -178,6 +183,8 @@ def test_attaching_where_pixels_are_drawn_by_others_is_refused(host_scene: Path,
         attach(trainer)
     with pytest.raises(InputError, match=r"Parallel does not draw its pixels in this process.*EdgeSEDataManagerConfig"):
         attach(SimpleNamespace(pipeline=SimpleNamespace(datamanager=Parallel())))
+    with pytest.raises(InputError, match=r"Whole draws no pixels.* train on whole images have no use"):
+        attach(SimpleNamespace(pipeline=SimpleNamespace(datamanager=Whole())))
 
 
 def test_patches_are_refused(host_scene: Path, tmp_path: Path) -> None:

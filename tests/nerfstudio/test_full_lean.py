@@ -96,6 +96,22 @@ def test_it_trains_on_alpha_and_on_pixels_that_see_a_cell(trained: Any) -> None:
     assert trained.pipeline.datamanager.eval_dataset[0]["image"].shape[-1] == 3
 
 
+def test_images_that_are_not_kept_are_trained_on_where_pixels_see_a_cell_too(
+    trained: Any, scene: Path, tmp_path: Path
+) -> None:
+    config = lean_config(scene, tmp_path)
+    config.pipeline.datamanager.train_num_images_to_sample_from = 3
+    config.pipeline.datamanager.train_num_times_to_repeat_images = 2
+    trainer = trainer_of(config)
+    seen = watch(trainer.pipeline.datamanager.train_pixel_sampler)
+    train(trainer, 8)
+    pixels = torch.cat([indices for *_, indices in seen])
+    batch = trained.pipeline.datamanager.train_image_dataloader.cached_collated_batch
+    masks = batch["mask"][torch.argsort(batch["image_idx"])]
+    assert len(pixels[:, 0].unique()) > 3
+    assert masks[tuple(pixels.T)].all()
+
+
 def test_its_loss_takes_the_samplers_weights(scene: Path, tmp_path: Path) -> None:
     trainer = trainer_of(lean_config(scene, tmp_path))
     train(trainer, 2)

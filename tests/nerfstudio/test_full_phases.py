@@ -21,8 +21,6 @@ from nerfstudio.data.pixel_samplers import PixelSampler  # noqa: E402
 from edge_se_sampler.errors import InputError  # noqa: E402
 from edge_se_sampler.nerfstudio.resume import PLAN_FILE, SAMPLER_FILE  # noqa: E402
 
-SAMPLER = SAMPLER_FILE.format(rank=0)
-
 
 def test_the_host_is_nerfstudio_itself() -> None:
     assert "site-packages" in Path(nerfstudio.__file__ or "").parts
@@ -91,7 +89,7 @@ def test_a_resumed_run_draws_what_the_uninterrupted_one_draws(strategy: str, hos
     config.timestamp = "first"
     first = trainer_of(copy.deepcopy(config))
     drawn(first, 5)
-    assert (first.base_dir / SAMPLER).exists() == (strategy in LEARNING)
+    assert (first.base_dir / SAMPLER_FILE.format(rank=0, step=4)).exists() == (strategy in LEARNING)
     steps = (
         1 if strategy in LEARNING else 3
     )  # the errors that follow depend on nerfstudio's random numbers, which go on
@@ -104,7 +102,7 @@ def test_what_was_learnt_by_another_checkpoint_is_not_taken(host_scene: Path, tm
     vars(config.pipeline.datamanager.pixel_sampler).update(early="uniform", late="actray", early_fraction=0.0)
     trainer = trainer_of(config)
     train(trainer, 3)
-    path = trainer.base_dir / SAMPLER
+    path = trainer.base_dir / SAMPLER_FILE.format(rank=0, step=2)
     saved = torch.load(path, weights_only=True)
     torch.save(saved | {"step": 1}, path)
     again = resumed(config, trainer)
@@ -112,10 +110,10 @@ def test_what_was_learnt_by_another_checkpoint_is_not_taken(host_scene: Path, tm
     assert not again.pipeline.datamanager.train_pixel_sampler.state_dict()["actray.distribution"]["clock"]
     for content in (saved | {"state": {"actray.distribution": {}}}, {"step": 2}, []):
         torch.save(content, path)
-        with pytest.raises(InputError, match=f"{SAMPLER}: cannot be read .*; delete it to let the strategies learn"):
+        with pytest.raises(InputError, match=f"{path.name}: cannot be read .*; delete it to let the strategies learn"):
             resumed(config, trainer)
     path.write_bytes(b"no state")
-    with pytest.raises(InputError, match=f"{SAMPLER}: cannot be read"):
+    with pytest.raises(InputError, match=f"{path.name}: cannot be read"):
         resumed(config, trainer)
 
 

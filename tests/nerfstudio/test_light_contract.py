@@ -40,13 +40,20 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from edge_se_sampler.data.blender import read_blender  # noqa: E402
 from edge_se_sampler.data.config import VanillaDataManagerConfig  # noqa: E402
 from edge_se_sampler.data.views import Views  # noqa: E402
-from edge_se_sampler.engine.config import OptimizerConfig, PipelineConfig, TrainerConfig  # noqa: E402
+from edge_se_sampler.engine.config import (  # noqa: E402
+    MANAGER,
+    SAMPLER,
+    OptimizerConfig,
+    PipelineConfig,
+    TrainerConfig,
+    override,
+)
 from edge_se_sampler.engine.pipeline import Pipeline  # noqa: E402
 from edge_se_sampler.engine.run_folder import RunFolder  # noqa: E402
-from edge_se_sampler.engine.session import resolve_config  # noqa: E402
+from edge_se_sampler.engine.session import prepare, prepare_resume, resolve_config  # noqa: E402
 from edge_se_sampler.engine.trainer import Trainer  # noqa: E402
 from edge_se_sampler.errors import InputError  # noqa: E402
-from edge_se_sampler.methods import STRATEGIES  # noqa: E402
+from edge_se_sampler.methods import STRATEGIES, method_configs  # noqa: E402
 from edge_se_sampler.nerfstudio.pixel_sampler import EdgeSEPixelSampler, EdgeSEPixelSamplerConfig  # noqa: E402
 from edge_se_sampler.sampling import settings as settings_module  # noqa: E402
 from edge_se_sampler.sampling.expansive import Expansive  # noqa: E402
@@ -420,6 +427,22 @@ def test_their_samplers_train_our_model_in_our_data_manager(config: Any, rays: i
     bundle, pixels = trainer.pipeline.datamanager.next_train(4)
     assert len(bundle) == len(pixels["image"]) == rays
     assert torch.equal(bundle.camera_indices[:, 0], pixels["indices"][:, 0])
+
+
+def test_a_run_with_their_sampler_is_saved_and_goes_on(scene: Path, tmp_path: Path) -> None:
+    config = override(method_configs()["vanilla-nerf"], {
+        "data": scene, "output_dir": tmp_path, "pipeline.model": tiny_config(), "max_num_iterations": 4,
+        SAMPLER: PixelSamplerConfig(), f"{MANAGER}.train_num_rays_per_batch": 16, "machine.device_type": "cpu",
+    })  # fmt: skip
+    torch.manual_seed(0)
+    trainer = prepare(config)
+    trainer.train()
+    read = trainer.run.config({"vanilla-nerf": config})
+    assert read.pipeline.datamanager.pixel_sampler == PixelSamplerConfig()
+    resumed = prepare_resume(trainer.run, read, max_num_iterations=6)
+    assert resumed.next_step == 4
+    resumed.train()
+    assert resumed.next_step == 6
 
 
 def test_their_patches_arrive_whole(scene: Path) -> None:

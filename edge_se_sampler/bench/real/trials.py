@@ -151,6 +151,8 @@ def _train(trial: Trial, member: int, scenes: Path, workplace: Path) -> _Trained
     trainer = prepare(override(method_configs()["lean-nerf"], changes))
     start = time.process_time()
     trainer.train()
+    if trainer.stop_requested:
+        raise KeyboardInterrupt
     cpu_seconds, seconds = time.process_time() - start, trainer.elapsed + trainer.setup_seconds
     return _Trained(trainer.pipeline.model, trainer.config, trainer.next_step, seconds, cpu_seconds)
 

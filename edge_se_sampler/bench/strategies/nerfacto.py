@@ -19,11 +19,11 @@ import torch
 
 from edge_se_sampler.bench.baselines.run import TimeIsUp
 from edge_se_sampler.bench.nerfstudio.host import build_config, build_trainer, render_test_views, skip_lpips_weights
-from edge_se_sampler.bench.outcomes import classify, measure_outcome
 from edge_se_sampler.bench.results import Run
+from edge_se_sampler.bench.strategies.measures import measure
 from edge_se_sampler.bench.strategies.trials import Settings, Trial, measured_views, read_views, sampler_settings
 from edge_se_sampler.engine.metrics import compute_metrics
-from edge_se_sampler.engine.rendering import Picture, to_pictures
+from edge_se_sampler.engine.rendering import to_pictures
 
 SMALL = {
     "model.implementation": "torch",
@@ -79,11 +79,9 @@ def run_nerfacto(trial: Trial, settings: Settings, data: Path) -> Run:
         views = render_test_views(trainer, numbers)
     rendered = [np.clip(view, 0, 1) for view in views]
     images = [compute_metrics(view, p.image, 1.0, p.mask) for view, p in zip(rendered, pictures, strict=True)]
-    outcome = measure_outcome(images, pictures, 1.0) if is_object else _outcome_of_capture(images, pictures)
     return {
         "size": list(pictures[0].image.shape[1::-1]),
-        **outcome,
-        **{key: _mean(images, key) for key in ("foreground_psnr", "edge_band_psnr")},
+        **measure(images, pictures, 1.0),
         **spent,
         "cpu_seconds": round(time.process_time() - begin, 2),
     }
@@ -140,20 +138,3 @@ def _train(trainer: Any, seconds: float | None) -> dict[str, Any]:
         "seconds": round(time.process_time() - start, 3),
         "ready_seconds": round(first, 3),
     }
-
-
-def _outcome_of_capture(images: list[dict[str, Any]], pictures: list[Picture]) -> dict[str, Any]:
-    """As `measure_outcome`, where no alpha tells an object: beside the mean color of each picture."""
-    plain = [np.broadcast_to(p.image.mean(axis=(0, 1)), p.image.shape) for p in pictures]
-    of_plain = [compute_metrics(image, p.image, 1.0, p.mask) for image, p in zip(plain, pictures, strict=True)]
-    psnr, plain_psnr = _mean(images, "psnr"), _mean(of_plain, "psnr")
-    assert psnr is not None
-    assert plain_psnr is not None
-    outcome = classify(psnr, plain_psnr, foreground_share=0.0)
-    return {"psnr": psnr, "background_psnr": plain_psnr, "foreground_share": None, "outcome": outcome}
-
-
-def _mean(images: list[dict[str, Any]], key: str) -> float | None:
-    """Of a metric over the images that have it."""
-    values = [image[key] for image in images if image[key] is not None]
-    return float(np.mean(values)) if values else None

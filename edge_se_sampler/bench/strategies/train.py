@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge_se_sampler.bench.outcomes import measure_outcome
 from edge_se_sampler.bench.results import Run
+from edge_se_sampler.bench.strategies.measures import measure
 from edge_se_sampler.bench.strategies.nerfacto import run_nerfacto
 from edge_se_sampler.bench.strategies.trials import (
     MODELS,
@@ -66,11 +66,10 @@ def run_trial(trial: Trial, settings: Settings, data: Path) -> Run:
         views = train if model.has_masks else without_alpha(train)
         trainer, run = _train(config, views, length.seconds if trial.plan == "seconds" else None)
         pictures = to_pictures(test.subset(measured_views(test, length)))
-        results = evaluate(trainer.pipeline.model, pictures)
+        images = evaluate(trainer.pipeline.model, pictures)["images"]
     return {
         "size": list(pictures[0].image.shape[1::-1]),
-        **measure_outcome(results["images"], pictures, trainer.pipeline.model.config.background_level),
-        **{key: results[key] for key in ("foreground_psnr", "edge_band_psnr")},
+        **measure(images, pictures, trainer.pipeline.model.config.background_level),
         **run,
         "cpu_seconds": round(time.process_time() - begin, 2),
     }

@@ -60,6 +60,8 @@ MODELS = {
 NERFACTO = "nerfacto"
 """Inside nerfstudio, see `strategies.nerfacto`."""
 ALL_MODELS = (*MODELS, NERFACTO)
+OF_CAPTURES = ("lean-no-masks", NERFACTO)
+"""What is trained on captures, too."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,8 @@ def make_scenes(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Renders scenes into out/<name>, folders that any loader of NeRF's Blender scenes reads; returns their paths.
+    """Renders scenes into out/<name>, folders that any loader of NeRF's Blender scenes reads, shifted ones only if it
+    heeds `cx` and `cy`; returns their paths.
 
     A picture is size x size pixels, RGBA, 8 bits, straight alpha; pixels are the same on every machine, and view i of
     a split does not depend on how many views the split has. Each json also says which of NeRF's scenes it is the
@@ -92,7 +93,7 @@ def _lay_out(workspace: Path, name: str, frame: Framing, cameras: Mapping[Split,
     views = []
     for split, split_cameras in cameras.items():
         if not split_cameras:
-            continue  # a split without frames is refused when it is read
+            continue
         (workspace / name / split).mkdir(parents=True)
         files = [f"{split}/r_{index}" for index in range(len(split_cameras))]
         origin = {"analog_of": ANALOG_OF[name], "generated_by": "edge_se_sampler"}

@@ -12,6 +12,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from edge_se_sampler.models import voxel_ops
 from edge_se_sampler.models.voxel_kernels.buffers import FEATURES, Buffers
 from edge_se_sampler.models.voxel_kernels.simd import load, minimum, prefetch, splat, store, total
 
@@ -122,7 +123,11 @@ def adam_rows(
     values: Tensor, mean: Tensor, square: Tensor, gradient: Tensor,
     *, lr: float, betas: tuple[float, float], eps: float, maximum: float, total_variation: float,
 ) -> None:  # fmt: skip
-    """As `voxel_ops.adam_rows`."""
+    """As `voxel_ops.adam_rows`, which steps rows of other widths than lean-nerf's."""
+    if values.shape[1] != FEATURES and (values.shape[1] != 1 or total_variation):
+        options = {"lr": lr, "betas": betas, "eps": eps, "maximum": maximum, "total_variation": total_variation}
+        voxel_ops.adam_rows(values, mean, square, gradient, **options)
+        return
     arrays = [value.detach().numpy() for value in (values, mean, square)]
     rows = gradient._indices()[0]
     if _ascend(rows.numpy()):  # of one backward pass, which autograd does not remember
