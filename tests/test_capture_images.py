@@ -35,8 +35,11 @@ from edge_se_sampler.data.image_file import ImageHeader, read_header
 from edge_se_sampler.data.lens import find_sources
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.transforms import read_transforms
+from edge_se_sampler.engine.config import MANAGER, override
+from edge_se_sampler.engine.session import _training_memory
 from edge_se_sampler.errors import InputError
-from edge_se_sampler.models.config import NeRFModelConfig
+from edge_se_sampler.methods import method_configs
+from edge_se_sampler.models.config import BYTES_PER_RAY, NeRFModelConfig, decide_size
 from edge_se_sampler.models.nerf import NeRFModel
 
 
@@ -153,6 +156,15 @@ def test_weights_and_their_moments_are_in_the_estimate(size: Any) -> None:
     weights = sum(weight.numel() for weight in NeRFModel(config, np.random.default_rng(0)).parameters())
     of_points = 2 * 4 * config.preset.width * (config.preset.depth + 2) * 2**14
     assert 16 * weights < config.training_memory(True, 1024) - of_points < 1.5 * 16 * weights
+
+
+def test_the_rays_that_a_step_has_are_in_the_estimate() -> None:
+    default = override(method_configs()["lean-nerf"], {"machine.device_type": "cpu"})
+    more, too_many = (override(default, {f"{MANAGER}.train_num_rays_per_batch": 2**n}) for n in (16, 20))
+    estimates = [_training_memory(config, True, 100) for config in (default, more, too_many)]
+    rays = decide_size(default.pipeline.model, 100).preset.rays
+    assert estimates[1] - estimates[0] == BYTES_PER_RAY * (2**16 - rays)
+    assert estimates[2] == estimates[1]  # they are looked at in parts
 
 
 def test_train_and_inspect_say_what_training_takes(
