@@ -42,6 +42,18 @@ def has_views(folder: Path, split: str) -> bool:
     return any(os.path.exists(entry.image.path) for entry in read_entries(top, folder))
 
 
+def is_left_out(folder: Path, split: str) -> bool:
+    """Whether nothing is to be read of a split: it has no json, or none that is there of its images, which is said; but
+    training images must be there. InputError as `has_views`."""
+    if has_views(folder, split):
+        return False
+    if has_split(folder, split):
+        if split == "train":
+            return False
+        print(f"{transforms_path(folder, split)}: none of its images exists: left out", file=sys.stderr)
+    return True
+
+
 def read_blender(
     folder: Path,
     split: Split,

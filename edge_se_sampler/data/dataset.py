@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from edge_se_sampler.data.blender import has_split, has_views, read_blender, transforms_path
+from edge_se_sampler.data.blender import has_views, is_left_out, read_blender, transforms_path
 from edge_se_sampler.data.blender import list_frames as list_blender_frames
 from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Capture, Split
 from edge_se_sampler.data.colmap import read_colmap
@@ -97,9 +97,7 @@ def read_split(
     )
     if data_format == "blender":
         _check_unsplit(settings, has_own_split=True)
-        if split != "train" and not has_views(folder, split):
-            if has_split(folder, split):
-                print(f"{transforms_path(folder, split)}: none of its images exists: left out", file=sys.stderr)
+        if split != "train" and is_left_out(folder, split):
             return None
         return _leave_out_unknown(read_blender(folder, split, load, progress), folder, split)
     capture, rows, eval_every = _read_capture(folder, split, settings, data_format)

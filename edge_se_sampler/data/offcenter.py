@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from edge_se_sampler.data.blender import has_split, has_views, read_blender, transforms_path
+from edge_se_sampler.data.blender import is_left_out, read_blender, transforms_path
 from edge_se_sampler.data.capture import SPLITS, Split
 from edge_se_sampler.data.frames import read_mask
 from edge_se_sampler.data.new_folder import staged_folders
@@ -145,12 +144,7 @@ def _plan_copies(data: Path, shift: Fractions, pad: Fractions | None) -> dict[Sp
     written: dict[str, tuple[str, str]] = {}
     cut_off: list[tuple[Entry, int]] = []
     needed = np.zeros(2)  # padding, over all views
-    found: list[Split] = []
-    for split in SPLITS:
-        if has_views(data, split) or (split == "train" and has_split(data, split)):
-            found.append(split)
-        elif has_split(data, split):
-            print(f"{transforms_path(data, split)}: none of its images exists: left out", file=sys.stderr)
+    found: list[Split] = [split for split in SPLITS if not is_left_out(data, split)]
     if not found:
         read_blender(data, "train")  # says that there is none
     for split in found:
