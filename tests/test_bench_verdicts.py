@@ -76,7 +76,7 @@ def test_more_failures_are_inferior_whatever_the_mean() -> None:
 
 @pytest.mark.parametrize(
     ("precrop", "edge", "expected"),
-    [({"mic", "chair"}, set(), "supported"), ({"mic"}, {"mic"}, "not supported"), (set(), set(), "undecided")],
+    [({"mic", "chair"}, set(), "supported"), ({"mic"}, {"mic"}, "not supported"), (set(), set(), "nothing to compare")],
 )
 def test_failures_are_prevented_where_the_baseline_fails(precrop: set[str], edge: set[str], expected: str) -> None:
     failing = {"precrop-nerf": precrop, "edge-nerf": edge}
@@ -84,6 +84,15 @@ def test_failures_are_prevented_where_the_baseline_fails(precrop: set[str], edge
         {(2, "precrop-nerf"): 25.0, (2, "edge-nerf"): 25.0}, lambda table, strategy, scene: scene in failing[strategy]
     )
     assert find(runs, "Off centre, Edge trains").verdict == expected
+
+
+def test_failures_of_few_runs_or_seeds_leave_what_is_prevented_undecided() -> None:
+    levels = {(2, "precrop-nerf"): 25.0, (2, "edge-nerf"): 25.0}
+    runs = make_runs(levels)
+    runs[0]["outcome"] = "collapsed"  # one of a scene's three
+    assert find(runs, "Off centre, Edge trains").verdict == "undecided"
+    two_seeds = [run for run in make_runs(levels) if run["seed"] != 2]
+    assert find(two_seeds, "Off centre, Edge trains").verdict == "undecided"
 
 
 def test_two_failed_runs_are_not_compared() -> None:

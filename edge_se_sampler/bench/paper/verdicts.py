@@ -54,7 +54,8 @@ class Claim:
     """Is supported if each of its comparisons is that has anything to compare.
 
     "better": the interval lies above 0. "not inferior": it lies above -0.3 dB, and there are no more failures.
-    "prevents failures": no run fails on a scene where most of the baseline's do.
+    "prevents failures": no run fails on a scene where most of the baseline's do; where none of them does, there is
+    nothing to compare.
     """
 
     text: str
@@ -175,10 +176,13 @@ def _judge_interval(kind: Kind, difference: PairedDifference) -> Verdict:
 
 
 def _judge_failures(pairs: list[list[Run]]) -> Verdict:
-    """On the scenes where most of the baseline's runs fail: does any of the arm's?"""
+    """On the scenes where most of the baseline's runs fail: does any of the arm's? If none fails at all, there is nothing
+    to prevent."""
     by_scene = groupby(pairs, lambda runs: runs[0]["scene"])
     failures = [[(failed(run), failed(baseline)) for run, baseline, *_ in group] for _, group in by_scene]
     hard = [f for f in failures if len(f) >= MIN_SEEDS and 2 * sum(baseline for _, baseline in f) > len(f)]
+    if failures and all(len(f) >= MIN_SEEDS and not any(baseline for _, baseline in f) for f in failures):
+        return "nothing to compare"
     if not hard:
         return "undecided"
     return "not supported" if any(arm for outcomes in hard for arm, _ in outcomes) else "supported"

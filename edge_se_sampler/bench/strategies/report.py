@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from pathlib import Path
+from typing import Any
 
 from edge_se_sampler.bench.outcomes import FAILURE_RULE
 from edge_se_sampler.bench.report import (
@@ -42,6 +43,15 @@ VERDICTS: dict[Verdict | None, str] = {
 """In words; the first that a strategy has anywhere says whether to use it, there alone if it is worse elsewhere."""
 ANSWERS: dict[Verdict | None, str] = {"better": "yes, ", "worse": "no, ", "same": "no need, ", None: ""}
 
+MODELS = {
+    "nerf": "the original NeRF, size tiny",
+    "lean": "`lean-nerf`",
+    "lean-no-masks": "`lean-nerf` on images without alpha, composited on white",
+    "nerfacto": "nerfstudio 1.1.5's, much smaller than its own settings and, but for captures, at learning rates of "
+    "3e-3, inside nerfstudio",
+}
+EQUAL = {"seconds": "at equal CPU seconds", "steps": "at equal steps"}
+
 
 def draw(folder: Path, workplace: Path | None) -> None:
     del workplace
@@ -61,6 +71,8 @@ def describe(folder: Path) -> str:
         lean=settings["lean"],
         failure_rule=FAILURE_RULE,
         scenes=_list_scenes(runs),
+        models=_list_models(runs, settings),
+        plans=" and ".join(text for plan, text in EQUAL.items() if any(run["plan"] == plan for run in runs)),
         claims=table_of_claims(runs),
         best=_table_of_best(runs),
         panels="\n\n".join(f"### {label}\n\n{_table_of(runs, panel)}" for panel, label in labels_of(runs).items()),
@@ -91,6 +103,18 @@ def _list_scenes(runs: list[Run]) -> str:
     objects = sorted({run["scene"] for run in runs}.difference(captures))
     parts = [" and ".join(objects)] * bool(objects) + [f"captures: {' and '.join(captures)}"] * bool(captures)
     return "; ".join(parts)
+
+
+def _list_models(runs: list[Run], settings: dict[str, dict[str, Any]]) -> str:
+    """A line for each model that was trained: what it is, and for how long."""
+    lines = []
+    for model, text in MODELS.items():
+        plans = {run["plan"] for run in runs if run["model"] == model}
+        length = settings["lean" if model.startswith("lean") else "nerf"]
+        lengths = [f"{length[plan]} {unit}" for plan, unit in (("seconds", "s"), ("steps", "steps")) if plan in plans]
+        if lengths:
+            lines.append(f"- `{model}`: {text}; {' or '.join(lengths)}")
+    return "\n".join(lines)
 
 
 def table_of_claims(runs: list[Run]) -> str:
