@@ -176,8 +176,8 @@ def _judge_interval(kind: Kind, difference: PairedDifference) -> Verdict:
 
 
 def _judge_failures(pairs: list[list[Run]]) -> Verdict:
-    """On the scenes where most of the baseline's runs fail: does any of the arm's? If none fails at all, there is nothing
-    to prevent."""
+    """On the scenes where most of the baseline's runs fail: does any of the arm's? If none fails, there is
+    nothing to prevent."""
     by_scene = groupby(pairs, lambda runs: runs[0]["scene"])
     failures = [[(failed(run), failed(baseline)) for run, baseline, *_ in group] for _, group in by_scene]
     hard = [f for f in failures if len(f) >= MIN_SEEDS and 2 * sum(baseline for _, baseline in f) > len(f)]
