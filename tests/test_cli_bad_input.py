@@ -284,6 +284,8 @@ class TestRuns:
         for unit in (1e-9, 0.001):
             assert "--depth-unit" in refused(edge_se, run, "render", run, "--depth-unit", unit)
         frames = ("--output-path", run / "frames", "--num-frames", 60)
+        assert "raw-depth" in refused(edge_se, run, "render", run, *frames, "--depth-unit", 0.001)
+        assert "folder of frames" in refused(edge_se, run, "render", run, *frames, "--frames-per-second", 5)
         assert "--num-frames" in refused(edge_se, run, "render", run, *frames, "--kind", "test")
         assert "--num-frames" in refused(edge_se, run, "render", run, *frames, "--camera-path", "path.json")
         assert ".json" in refused(edge_se, run, "eval", run, "--output-path", tmp_path / "eval.png")

@@ -121,6 +121,20 @@ def test_a_single_camera_tells_nothing() -> None:
     assert (model.depths, model.near_share) == ((10, 60), None)
 
 
+@pytest.mark.parametrize("radius", [0.0, 1e-12, 1e-3])
+@pytest.mark.parametrize("seed", range(6))
+def test_cameras_that_turn_about_one_point_tell_nothing(seed: int, radius: float) -> None:
+    """Their axes meet where they are, but for rounding."""
+    views = opaque(ball_views(12, 32))
+    rng = np.random.default_rng(seed)
+    poses = views.cameras.camera_to_worlds.clone()
+    poses[:, :, :3] = torch.from_numpy(np.linalg.qr(rng.normal(size=(12, 3, 3)))[0])
+    poses[:, :, 3] = torch.from_numpy(rng.normal(size=3) + radius * rng.normal(size=(12, 3)))
+    turning = replace(views, cameras=replace(views.cameras, camera_to_worlds=poses), depths=None)
+    with pytest.raises(InputError, match=r"give --pipeline\.model\.near"):
+        find_depths(turning)
+
+
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (-8.0, 0.0, 0.0), (-60.0, 3.0, 40.0)])
 @pytest.mark.parametrize("show", [opaque, lambda views: views])
 def test_nothing_is_told_by_where_the_origin_is(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import lean_models
@@ -12,8 +13,10 @@ from fake_device import DEVICE, FakeTensor, fake_device
 from tiny import tiny_config, tiny_trainer
 
 from edge_se_sampler import devices
+from edge_se_sampler.engine import session
 from edge_se_sampler.engine.config import MANAGER, MODEL, override
 from edge_se_sampler.engine.rendering import render_rays
+from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import choose_device
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.errors import InputError
@@ -88,6 +91,19 @@ def test_nerfs_train_on_a_device_of_their_own(method: str, changes: dict[str, An
         found = found_by(trainer)
         assert isinstance(next(trainer.pipeline.model.parameters()), FakeTensor)
     assert found == pytest.approx(found_by(nerf_trainer(method, "cpu", **changes)), rel=1e-4)
+
+
+def test_runs_of_several_devices_are_averaged_on_the_first_ones(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_device():
+        trainers = [nerf_trainer("vanilla-nerf", device) for device in (str(DEVICE), "cpu")]
+        rays = trainers[0].pipeline.datamanager.probe_rays(20, np.random.default_rng(0))
+        models = iter([trainer.pipeline.model for trainer in trainers])
+        monkeypatch.setattr(session, "load_model", lambda *_: (next(models), Path()))
+        mean, _ = session.load_ensemble([(RunFolder(tmp_path / f"{i}"), trainers[i].config) for i in range(2)])
+        (found,), (alone,) = ([render_rays(model, rays)] for model in (mean, trainers[0].pipeline.model))
+    torch.testing.assert_close(found, alone)  # the same initial weights
 
 
 @pytest.mark.slow

@@ -124,9 +124,9 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, list[str]]]:
     """What has been rendered: index and outputs of each frame."""
     calls = []
 
-    def render(model: Any, cameras: Cameras, index: int, outputs: list[str], unit: float) -> dict[str, np.ndarray]:
+    def render(model: Any, cameras: Cameras, index: int, outputs: list[str], *others: Any) -> dict[str, np.ndarray]:
         calls.append((index, outputs))
-        return render_frame(model, cameras, index, outputs, unit)
+        return render_frame(model, cameras, index, outputs, *others)
 
     monkeypatch.setattr(frames, "render_frame", render)
     return calls

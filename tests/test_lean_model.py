@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import math
 from dataclasses import replace
 from typing import Any
@@ -218,5 +219,32 @@ def test_without_numba_one_line_says_what_it_would_bring(
     try:
         assert steps_of(tiny_trainer(config_of(5), VIEWS), 5)
         assert capsys.readouterr().err.count("edge-se-sampler[fast]") == 1
+    finally:
+        voxel_backend.compiled_ops.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("problem", "remedy"),
+    [
+        (ImportError("Numba needs NumPy 2.4 or less"), "--upgrade"),
+        (RuntimeError("cannot cache function 'march_chunk':\nno locator available"), "NUMBA_CACHE_DIR"),
+    ],
+)
+def test_where_numba_cannot_be_used_one_line_says_why(
+    problem: Exception, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import_module = builtins.__import__
+
+    def fail(name: str, *arguments: Any, **options: Any) -> Any:
+        if name == "edge_se_sampler.models" and "voxel_kernels" in arguments[2]:
+            raise problem
+        return import_module(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", fail)
+    voxel_backend.compiled_ops.cache_clear()
+    try:
+        assert steps_of(tiny_trainer(config_of(5), VIEWS), 5)
+        said = capsys.readouterr().err
+        assert (said.count("\n"), str(problem).split()[-1] in said, remedy in said) == (1, True, True)
     finally:
         voxel_backend.compiled_ops.cache_clear()

@@ -79,6 +79,9 @@ def test_a_time_budget_is_kept_where_a_resumed_run_is_set_up_sooner(
         resumed.train()
     assert resumed.setup_seconds == 2
     assert resumed.elapsed == pytest.approx(4, rel=0.05)
+    found = RunFolder(first.run.path).config(method_configs())
+    assert found.segments is not None  # the plan that came out
+    assert found.max_seconds == 1  # of the run itself
 
 
 @pytest.mark.parametrize(
@@ -189,10 +192,13 @@ def test_a_run_is_not_resumed_on_a_scene_that_has_changed(larger: Path, tmp_path
         prepare_resume(trainer.run, trainer.config)
     grid = trainer.pipeline.model.grid
     resumed = prepare_resume(trainer.run, trainer.config, max_num_iterations=3, changed_data=True)
-    assert resumed.pipeline.model.grid.is_of_the_same_scene(grid)
+    assert (resumed.pipeline.model.grid.bricks == grid.bricks).all()
     resumed.train()
     assert resumed.next_step == 3
-    assert Viewed.load(trainer.run, trainer.config).model.grid.is_of_the_same_scene(grid)  # as rendering does
+    grid = resumed.pipeline.model.grid
+    assert (Viewed.load(trainer.run, trainer.config).model.grid.bricks == grid.bricks).all()  # as rendering does
+    again = prepare_resume(trainer.run, resumed.config, max_num_iterations=4)  # these are its images now
+    assert (again.pipeline.model.grid.bricks == grid.bricks).all()
 
 
 def test_a_budget_and_what_one_came_out_as_are_not_both_given(larger: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from tiny import SMALL
 
 from edge_se_sampler.engine.checkpoint import latest_checkpoint
 from edge_se_sampler.engine.early_stopping import EarlyStopping
-from edge_se_sampler.engine.run_folder import RunFolder
+from edge_se_sampler.engine.run_folder import EventWriter, RunFolder
 from edge_se_sampler.engine.session import prepare_resume
 from edge_se_sampler.methods import method_configs
 
@@ -47,6 +47,18 @@ def test_an_extended_run_goes_on_from_its_optimizers_state(run: Path) -> None:
     steps = {int(state["step"]) for state in trainer.optimizer.state.values()}
     assert steps == {6}
     assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(trainer.config.preset.learning_rate * 0.1**0.2)
+
+
+def test_tensorboard_shows_no_step_of_a_killed_training_twice(run: Path, edge_se) -> None:
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    lost = EventWriter(run)
+    for step in (10, 15, 20):
+        lost.write({"step": step, "loss": 9.0})
+    lost.close()
+    assert edge_se("resume", run, "--max-num-iterations", 16).code == 0
+    shown = event_accumulator.EventAccumulator(str(run)).Reload().Scalars("loss")
+    assert [event.step for event in shown] == [line["step"] for line in lines_with(run, "loss")] == [0, 5, 10, 15]
+    assert max(event.value for event in shown) < 9
 
 
 def test_a_run_that_is_longer_than_its_config_says_has_ended(run: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
-from edge_se_sampler.engine.frames import render_frame
+from edge_se_sampler.engine.frames import find_depth_range, render_frame
 from edge_se_sampler.engine.rendering import CameraRays, Picture, render_outputs, render_view
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.ensemble import Ensemble
@@ -172,3 +174,26 @@ def test_several_models_are_empty_where_all_of_them_are() -> None:
     found, expected = outputs_of(model, rays[0 : WIDTH * HEIGHT]), outputs_of(model, rays.camera.image_rays(0))
     for key in OUTPUTS:
         torch.testing.assert_close(found[key], expected[key], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("factor", [0.35, 3.0])
+def test_a_camera_path_sees_what_training_views_had_no_depth_for(factor: float) -> None:
+    """Of a ball of a radius of two thirds, from so many times the distance of about 3."""
+    model, camera = ball_model(1), looking((0.5 * factor, -3.0 * factor, factor), 160.0 * factor)
+    model.config = replace(model.config, near=2.0, far=4.0)
+    names, depths = ("accumulation", "raw-depth"), find_depth_range(model, camera)
+    found = render_frame(model, camera, 0, names, 1e-3, depths)
+    seen = found["raw-depth"][found["accumulation"] > 200]
+    distance = 1e3 * factor * 10.25**0.5
+    assert len(seen) > 1000
+    assert distance - 700 < seen.min() < distance - 300
+    assert depths[0] <= seen.min() / 1e3 < seen.max() / 1e3 < depths[1]
+    assert render_frame(model, camera, 0, names, 1e-3)["accumulation"].max() == 0  # as a held-out view would be
+
+
+def test_depths_stay_where_they_show_all_cells() -> None:
+    model = ball_model(1)
+    model.config = replace(model.config, near=0.5, far=9.0)
+    assert find_depth_range(model, looking((0.5, -3.0, 1.0))) == (0.5, 9.0)
+    model.grid = None  # pyright: ignore[reportAttributeAccessIssue]
+    assert find_depth_range(model, looking((0.5, -30.0, 1.0))) == (0.5, 9.0)

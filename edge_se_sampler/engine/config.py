@@ -114,7 +114,7 @@ class TrainerConfig(InstantiateConfig):
     """Iterations between lines of metrics.jsonl."""
     reinit_dead: bool = False
     """Reinitialize a dead network (density 0 everywhere, hence no gradient), each time with other random numbers of the
-    seed."""
+    seed. A softplus density cannot die."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

@@ -18,6 +18,7 @@ from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.rendering import CameraRays, find_surfaces, render_outputs
 from edge_se_sampler.errors import InputError, check_value, os_errors_as_input_errors
 from edge_se_sampler.models.ray_model import RayModel
+from edge_se_sampler.occupancy.bricks import OFFSETS
 
 FRAMES_ONLY = {"rgba": "is transparent", "raw-depth": "has 16 bits"}
 """Outputs that no video shows, and why."""
@@ -27,9 +28,15 @@ MAX_16_BITS = 2**16 - 1
 
 
 def render_frame(
-    model: RayModel, cameras: Cameras, index: int, outputs: Sequence[str], depth_unit: float
+    model: RayModel,
+    cameras: Cameras,
+    index: int,
+    outputs: Sequence[str],
+    depth_unit: float,
+    depths: tuple[float, float] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Images of one camera, by output.
+    """Images of one camera, by output; of what is between near and far, or, with `depths`, which are nearest and
+    farthest then, of all that the model has.
 
     rgb           (H, W, 3) uint8
     rgba          (H, W, 4) uint8: straight alpha, the accumulation
@@ -37,23 +44,25 @@ def render_frame(
     depth         (H, W, 3) uint8: near is red, far is blue, nothing is the background
     raw-depth     (H, W) uint16: depth along the optical axis in depth_unit world units; 0 where nothing is
     """
-    rays = CameraRays.of(model, cameras[[index]])
+    rays = CameraRays.of(model, cameras[[index]], everything=depths is not None)
     size = int(rays.camera.height), int(rays.camera.width)
     parts = []
     for some in model.chunks(math.prod(size)):  # all rays of a large frame would take many gigabytes
-        rendered = _render_pixels(model, rays[some], depth_unit)
+        rendered = _render_pixels(model, rays[some], depth_unit, depths or model.config.depths)
         parts.append([rendered[name] for name in outputs])
     images = map(np.concatenate, zip(*parts, strict=True))
     return {name: image.reshape(*size, *image.shape[1:]) for name, image in zip(outputs, images, strict=True)}
 
 
-def _render_pixels(model: RayModel, rays: RayBundle, depth_unit: float) -> dict[str, np.ndarray]:
+def _render_pixels(
+    model: RayModel, rays: RayBundle, depth_unit: float, depths: tuple[float, float]
+) -> dict[str, np.ndarray]:
     """The outputs of `render_frame` of n rays, (n, ...)."""
-    near, far = model.config.depths
+    near, far = depths
     keys = ("rgb_fine", "accumulation_fine", "depth_fine", "background")
     outputs = render_outputs(model, rays, keys)
     norm = rays.metadata["directions_norm"].cpu()
-    colors, distance = (x.numpy() for x in find_surfaces(outputs, far * norm))
+    colors, distance = (x.numpy() for x in find_surfaces(outputs, model.config.depths[1] * norm))
     rgb, alpha, background = (outputs[key].numpy() for key in (keys[0], keys[1], keys[3]))
     alpha = alpha.clip(0, 1)
     depth = (distance / norm.numpy()).astype(np.float64).clip(near, far)
@@ -66,6 +75,18 @@ def _render_pixels(model: RayModel, rays: RayBundle, depth_unit: float) -> dict[
         "depth": to_uint8(alpha * turbo + (1 - alpha) * background),
         "raw-depth": steps[:, 0].astype(np.uint16),
     }
+
+
+def find_depth_range(model: RayModel, cameras: Cameras) -> tuple[float, float]:
+    """The model's near and far, moved to where cameras see all of its cells."""
+    near, far = model.config.depths
+    if model.grid is None:
+        return near, far
+    poses = cameras.camera_to_worlds.cpu().double()
+    box = (model.grid.size * model.grid.cell_size).cpu()
+    corners = model.grid.aabb_min + OFFSETS * box
+    depth = -((corners - poses[:, None, :, 3]) * poses[:, None, :, 2]).sum(dim=2)
+    return min(near, max(float(depth.min()), 0.0)), max(far, float(depth.max()))
 
 
 def choose_depth_unit(far: float, unit: float | None) -> float:
@@ -84,10 +105,11 @@ def write_frames(
     outputs: Sequence[str],
     depth_unit: float,
     checkpoints: Sequence[str],
+    depths: tuple[float, float] | None = None,
 ) -> None:
     """Write FOLDER/OUTPUT/00000.png, ... of all cameras, and frames.json, which says what they are, and of which
-    checkpoints, by `name_checkpoint`. What is there and whole is kept. InputError if the folder has other things, or
-    frames of other checkpoints, cameras or units."""
+    checkpoints, by `name_checkpoint`; depths: as `render_frame`. What is there and whole is kept. InputError if the
+    folder has other things, or frames of other checkpoints, cameras or units."""
     facts = {
         "checkpoint": "; ".join(checkpoints),
         "depth_unit": depth_unit,
@@ -102,7 +124,7 @@ def write_frames(
     done = missing.count([])
     with Progress(len(frames), "rendering", start=done) as progress:
         for i in (i for i, names in enumerate(missing) if names):
-            for name, image in render_frame(model, cameras, i, missing[i], depth_unit).items():
+            for name, image in render_frame(model, cameras, i, missing[i], depth_unit, depths).items():
                 write_image(frames[i][name], image)
             done += 1
             progress.update(done)

@@ -59,10 +59,12 @@ class Pipeline:
             analysis = analyze_views(views, model_config)
             grid, hull = analysis.grid(), analysis.hull
             has_masks = analysis.num_silhouettes > 0
-            if saved_grid is not None and not (changed_data or saved_grid.is_of_the_same_scene(grid)):
-                changed = "its images, masks or cameras have changed since, or this machine rounds differently"
-                remedy = "restore the data, or go on in these cells by --changed-data True"
-                raise InputError(f"the scene's cells are not the checkpoint's: {changed}; {remedy}")
+            if saved_grid is not None:
+                if not (changed_data or saved_grid.is_of_the_same_scene(grid)):
+                    changed = "its images, masks or cameras have changed since, or this machine rounds differently"
+                    remedy = "restore the data, or go on in these cells by --changed-data True"
+                    raise InputError(f"the scene's cells are not the checkpoint's: {changed}; {remedy}")
+                saved_grid.scene = grid.scene  # that is its data from now on
             if manager_config.skip_empty_rays and has_masks:
                 views = views.with_masks(analysis.hit_pixels)
         if isinstance(manager_config.pixel_sampler, SamplingSettings):

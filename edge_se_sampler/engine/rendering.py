@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -43,12 +44,15 @@ class CameraRays:
 
     camera: Cameras
     empty_depths: torch.Tensor | None
+    model: RayModel | None = None
+    """Whose cells rays meet wherever they are; None: those between near and far."""
 
     @classmethod
     @torch.no_grad()
-    def of(cls, model: RayModel, camera: Cameras) -> CameraRays:
+    def of(cls, model: RayModel, camera: Cameras, *, everything: bool = False) -> CameraRays:
+        """`everything`: see `meet_all_cells`."""
         camera = camera.to(model.device, torch.float32)
-        return cls(camera, model.find_empty_depths(camera))
+        return cls(camera, model.find_empty_depths(camera), model if everything else None)
 
     @property
     def not_empty(self) -> torch.Tensor:
@@ -61,7 +65,17 @@ class CameraRays:
         rays = self.camera.image_rays(0, pixels)
         if self.empty_depths is not None:
             rays.metadata["empty_depths"] = self.empty_depths[pixels, None]
+        if self.model is not None:
+            meet_all_cells(self.model, rays)
         return rays
+
+
+def meet_all_cells(model: RayModel, rays: RayBundle) -> None:
+    """Let rays meet all cells that a model has, also nearer or farther off than the depths of its training views;
+    without a grid they stay as they are."""
+    if model.grid is not None:
+        empty = model.grid.empty_depth(rays.origins)[:, None] * rays.metadata["directions_norm"]
+        rays.metadata.update(nears=empty, fars=torch.full_like(empty, math.inf))
 
 
 def to_pictures(views: Views) -> list[Picture]:

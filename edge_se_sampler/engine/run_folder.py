@@ -128,10 +128,10 @@ class RunFolder:
 
 class EventWriter:
     """Writes the numbers of metrics.jsonl's lines as TensorBoard's scalars; nothing without the extra, nor in a folder
-    whose name is no text."""
+    whose name is no text. What was written of first_step and later ones is no longer shown."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._writer = folder, None
+    def __init__(self, folder: Path, first_step: int | None = None) -> None:
+        self._folder, self._first_step, self._writer = folder, first_step, None
         is_text = os.fsencode(folder).decode(errors="replace") == str(folder)  # others TensorBoard cannot name
         self._can_write = is_text and find_spec("tensorboard") is not None
 
@@ -142,7 +142,7 @@ class EventWriter:
             if self._writer is None:
                 from torch.utils.tensorboard import SummaryWriter
 
-                self._writer: Any = SummaryWriter(str(self._folder))
+                self._writer: Any = SummaryWriter(str(self._folder), purge_step=self._first_step)
                 with contextlib.suppress(AttributeError):  # its thread's failure is raised here: printed once is enough
                     self._writer.file_writer.event_writer._async_writer._worker._invoke_excepthook = lambda _: None
             for key, value in line.items():

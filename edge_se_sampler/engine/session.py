@@ -117,12 +117,12 @@ def prepare_resume(
     _, state = load_state(run, config)
     if max_num_iterations is not None:
         config = _extend(config, state, max_num_iterations)
-    session_config = replace(config, max_seconds=max_seconds)
-    session_config.check()
+    replace(config, max_seconds=max_seconds).check()
     check_run_data(config)
     if ranks.is_main():
         make_folder(run.path / "previews", "the run's")  # which git, for one, leaves out when it is empty
-    trainer = prepare(session_config, run, saved_grid(state["model"]), changed_data=changed_data)
+    trainer = prepare(config, run, saved_grid(state["model"]), changed_data=changed_data)
+    trainer.max_seconds = max_seconds
     trainer.resume(state, changed_data)
     if ranks.is_main():
         run.write_config(config)
@@ -170,7 +170,9 @@ def load_ensemble(runs: Sequence[tuple[RunFolder, TrainerConfig]]) -> tuple[RayM
                     f"{other.path}: {name} is {value}, but {expected} in {run.path}; average runs that agree in it"
                 )
     models, checkpoints = zip(*(load_model(*each) for each in runs), strict=True)
-    return models[0] if len(models) == 1 else Ensemble(models), list(checkpoints)
+    # each run says on which device
+    members = [model.to(models[0].device) for model in models]
+    return members[0] if len(members) == 1 else Ensemble(members), list(checkpoints)
 
 
 def read_test_views(config: TrainerConfig) -> Views:

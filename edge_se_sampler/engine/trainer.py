@@ -48,6 +48,7 @@ class Trainer:
         num_steps = config.new_num_iterations or config.max_num_iterations
         self.plan = Plan(num_steps, config.segments or (), config.budget_seconds)
         self.first_plan = Plan(config.max_num_iterations) if config.new_num_iterations else self.plan
+        self.max_seconds = config.max_seconds  # whoever goes on with a run may have another limit
         self.early_stopping = EarlyStopping(config.patience, config.min_gain)
         self.setup_seconds = setup_seconds
         self.optimizer = create_adam(pipeline.model.parameter_groups(), config.preset, config.optimizer)
@@ -87,7 +88,8 @@ class Trainer:
         if not (is_same_data or changed_data):
             remedy = "restore them, or add --changed-data True"
             raise InputError(f"{self.config.data}: not the training images that the run began with; {remedy}")
-        load_weights(self.pipeline.model, state["model"])
+        weights, grid = state["model"], self.pipeline.model.grid
+        load_weights(self.pipeline.model, weights if grid is None else {**weights, "grid.scene": grid.scene})
         check_training(state, self)
         if state["optimizer"] is not None:  # of a run that has ended
             self.optimizer.load_state_dict(state["optimizer"])
@@ -106,13 +108,14 @@ class Trainer:
             group["fused"] = self.optimizer.defaults["fused"]  # the torch or the device may be another
         if ranks.is_main():
             self.run.drop_metrics_after(state["step"])
+            self.events = EventWriter(self.run.path, self.next_step)
 
     def train(self) -> None:
         """Train until the planned iterations are done, max_seconds have passed, patience is lost, or Ctrl-C; then save.
         FloatingPointError if the loss or a weight is not finite: the last checkpoint is kept."""
         config = self.config
         began = time.monotonic() - self.elapsed
-        deadline = math.inf if config.max_seconds is None else time.monotonic() + config.max_seconds
+        deadline = math.inf if self.max_seconds is None else time.monotonic() + self.max_seconds
         plan = self.plan
         (self.setup_seconds,) = ranks.agree(self.setup_seconds)
         plan.decide(self.next_step, self.setup_seconds + self.elapsed)

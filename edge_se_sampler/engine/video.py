@@ -18,7 +18,14 @@ from edge_se_sampler.data.camera_path import read_camera_path, undo_dataparser
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, write_atomically
-from edge_se_sampler.engine.frames import FRAMES_ONLY, choose_depth_unit, name_checkpoint, render_frame, write_frames
+from edge_se_sampler.engine.frames import (
+    FRAMES_ONLY,
+    choose_depth_unit,
+    find_depth_range,
+    name_checkpoint,
+    render_frame,
+    write_frames,
+)
 from edge_se_sampler.engine.progress import Progress
 from edge_se_sampler.engine.run_folder import RunFolder
 from edge_se_sampler.engine.session import load_ensemble, read_test_views, read_train_views
@@ -66,14 +73,19 @@ def render_run(
     rate = next(rate for rate in rates if rate is not None)
     if output_path.suffix:
         check_video(output_path, outputs, rate)
-    unit = choose_depth_unit(config.pipeline.model.depths[1], depth_unit)
+    elif frames_per_second is not None:
+        raise InputError("--frames-per-second has no effect on a folder of frames: leave it out")
+    if depth_unit is not None and "raw-depth" not in outputs:
+        raise InputError("--depth-unit has no effect without raw-depth among the --outputs: leave it out")
     model, paths = load_ensemble(runs)
     checkpoints = [name_checkpoint(path) for path in paths]  # now: a training may delete them meanwhile
     cameras = find_cameras(config, kind or "spiral", num_frames) if path is None else path.cameras
+    depths = None if path is None else find_depth_range(model, cameras)  # of a path all is shown that a viewer shows
+    unit = choose_depth_unit((depths or model.config.depths)[1], depth_unit)
     if output_path.suffix:
-        write_video(output_path, _video_frames(model, cameras, outputs, unit), rate)
+        write_video(output_path, _video_frames(model, cameras, outputs, unit, depths), rate)
     else:
-        write_frames(output_path, model, cameras, outputs, unit, checkpoints)
+        write_frames(output_path, model, cameras, outputs, unit, checkpoints, depths)
 
 
 def find_cameras(config: TrainerConfig, kind: str, num_frames: int) -> Cameras:
@@ -106,8 +118,11 @@ def check_video(path: Path, outputs: Sequence[str], frames_per_second: float) ->
             raise InputError("mp4 needs the [video] extra: pip install 'edge-se-sampler[video]', or use .gif") from None
 
 
-def _video_frames(model: RayModel, cameras: Cameras, outputs: Sequence[str], unit: float) -> Iterator[np.ndarray]:
-    """(H, W, 3) uint8 frames, one after another, of outputs side by side. InputError if they differ in size."""
+def _video_frames(
+    model: RayModel, cameras: Cameras, outputs: Sequence[str], unit: float, depths: tuple[float, float] | None
+) -> Iterator[np.ndarray]:
+    """(H, W, 3) uint8 frames of `render_frame`, one after another, outputs side by side. InputError if they differ in
+    size."""
     (height, width), *others = torch.unique(torch.cat((cameras.height, cameras.width), dim=1), dim=0).tolist()
     if others:
         raise InputError("the views differ in size and make no video; give --output-path a folder (no ending)")
@@ -115,7 +130,7 @@ def _video_frames(model: RayModel, cameras: Cameras, outputs: Sequence[str], uni
         raise InputError("the views are 1 pixel wide or high, which is no video")
     with Progress(len(cameras), "rendering") as progress:
         for i in range(len(cameras)):
-            images = render_frame(model, cameras, i, outputs, unit)
+            images = render_frame(model, cameras, i, outputs, unit, depths)
             channels = (np.broadcast_to(np.atleast_3d(images[name]), (height, width, 3)) for name in outputs)
             yield np.concatenate(list(channels), axis=1)
             progress.update(i + 1)

@@ -80,8 +80,8 @@ class ModelConfig(InstantiateConfig, ABC):
     far: float | None = None
     """Depth at which samples end, world units; by default from the scene."""
     voxel_size_px: float = 1.0
-    """A quarter of a grid cell's size, in footprints of a pixel at the center of the scene; larger where there would be
-    too many cells."""
+    """A quarter of a grid cell's size, where there is a grid (empty-space-skipping), in footprints of a pixel at the
+    center of the scene; larger where there would be too many cells."""
 
     @property
     def preset(self) -> SizePreset:

@@ -34,6 +34,9 @@ they see."""
 CAMERA_FACTORS = 0.3, 2.0
 """Near and far of cameras alone, as multiples of their median distance from the focus: as far behind it as they are
 before it; and nothing that only one or two of them see, for there a model can make up something for each image."""
+MIN_AHEAD, MIN_MOVE = 0.9, 1e-6
+"""Share of the cameras that must have the focus before them; and how far they must be from each other, as a share of
+how far they are from the origin: less is rounding."""
 NEAR_SHARE = 0.45
 """Part of the way from a camera to the focus in which nothing is that it sees, where neither masks nor points tell. A
 camera that is close to what it shows is so to the focus, too."""
@@ -146,10 +149,13 @@ def _depths_of_hull(cameras: Cameras, hull: Hull) -> tuple[np.ndarray, np.ndarra
 
 
 def _depths_of_cameras(views: Views) -> DepthRange | None:
-    """Multiples of the distance between the cameras and what they look at; None if their axes do not meet there."""
+    """Multiples of the distance between the cameras and what they look at; None if their axes do not meet there, as of
+    cameras that turn about one point, or look outward from it."""
     _, depth = find_focus(views.cameras)
     distance = float(np.median(depth))
-    if len(views.cameras) < 2 or not distance > 0:
+    position = views.cameras.camera_to_worlds[:, :, 3].numpy()
+    moves = np.ptp(position, axis=0).max() > MIN_MOVE * np.abs(position).max()
+    if len(views.cameras) < 2 or not moves or (depth > 0).mean() < MIN_AHEAD:
         return None
     near, far = _rounded(*(factor * distance for factor in CAMERA_FACTORS))
     return DepthRange(near, far, "the cameras: 0.3 to 2 times as far as what they look at", NEAR_SHARE)

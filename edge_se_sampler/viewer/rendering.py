@@ -14,7 +14,7 @@ from torch import Tensor
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.frames import SEEN
-from edge_se_sampler.engine.rendering import render_outputs
+from edge_se_sampler.engine.rendering import meet_all_cells, render_outputs
 from edge_se_sampler.models.rendering import remove_background
 from edge_se_sampler.sampling.edges import unit_float
 from edge_se_sampler.viewer.viewed import Viewed
@@ -60,8 +60,8 @@ class Renderer:
         self, camera: Cameras, keys: Sequence[str], interrupted: Callable[[], bool], *, everything: bool
     ) -> dict[str, Tensor] | None:
         """Some of the model's outputs (H, W, channels) for a camera, on the CPU; None: interrupted. A turn ends after
-        some rays: training goes on, others look, and whether the picture is still wanted is asked again. Of lean-nerf
-        `everything` is seen that the model has, also nearer or farther off than the depths of its training views."""
+        some rays: training goes on, others look, and whether the picture is still wanted is asked again. `everything`:
+        see `meet_all_cells`."""
         height, width = int(camera.height[0]), int(camera.width[0])
         count, first, turns, began = height * width, 0, [], time.monotonic()
         while first < count:
@@ -71,9 +71,8 @@ class Renderer:
             with self.viewed.turns:
                 turn_began, model = time.monotonic(), self.viewed.model
                 rays = camera.to(model.device, torch.float32).image_rays(0, slice(first, last))
-                if everything and model.grid is not None:
-                    empty = model.grid.empty_depth(rays.origins)[:, None] * rays.metadata["directions_norm"]
-                    rays.metadata.update(nears=empty, fars=torch.full_like(empty, math.inf))
+                if everything:
+                    meet_all_cells(model, rays)
                 turns.append(render_outputs(model, rays, keys))
                 self.turn.record(last - first, time.monotonic() - turn_began)
             first = last
