@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -151,6 +153,28 @@ def test_the_datas_own_json_is_not_overwritten(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="not overwritten"):
             export_cameras(config_of(tmp_path, data_format), tmp_path / "images" / ".." / "transforms.json")
     assert json.loads((tmp_path / "transforms.json").read_text()) == transforms()
+
+
+def test_a_json_of_something_else_is_not_replaced(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    other, again = tmp_path / "config.json", tmp_path / "cameras.json"
+    other.write_text('{"camera_model": "OPENCV", "frames": []}')
+    with pytest.raises(InputError, match="none that was exported here"):
+        export_cameras(config_of(tmp_path, "transforms"), other)
+    assert json.loads(other.read_text())["frames"] == []
+    for _ in range(2):  # what was exported is
+        export_cameras(config_of(tmp_path, "transforms"), again)
+
+
+def test_a_mask_that_is_a_bomb_is_said_in_a_line(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    (tmp_path / "masks").mkdir()
+    header = b"IHDR" + struct.pack(">IIBBBBB", 20_000, 20_000, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    (tmp_path / "masks" / NAMES[0]).write_bytes(png)
+    assert document["frames"]
+    with pytest.raises(InputError, match=NAMES[0]):
+        export_cameras(config_of(tmp_path, "transforms"), tmp_path / "cameras.json")
 
 
 def test_blender_lists_are_not_overwritten(tmp_path: Path) -> None:

@@ -8,10 +8,11 @@ import os
 import random
 import shutil
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,12 @@ from tiny import SMALL
 
 from edge_se_sampler.bench.results import read_result
 from edge_se_sampler.bench.runner import run_experiment
+from edge_se_sampler.engine.config import MODEL, override
+from edge_se_sampler.engine.files import check_output
 from edge_se_sampler.engine.run_folder import EventWriter
+from edge_se_sampler.engine.session import prepare
 from edge_se_sampler.errors import InputError
+from edge_se_sampler.methods import method_configs
 
 SOME, ALL = 4, pytest.param(None, marks=pytest.mark.slow)
 
@@ -278,3 +283,46 @@ def test_a_folder_whose_name_is_no_text_has_no_events(tmp_path: Path) -> None:
     (events := EventWriter(tmp_path / "s")).write({"step": 0, "loss": 1.0})
     events.close()
     assert (tmp_path / "s").exists()
+
+
+def test_a_tensorboard_that_cannot_be_imported_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tensorboard")
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    events = EventWriter(tmp_path)
+    for step in range(2):
+        events.write({"step": step, "loss": 1.0})
+    events.close()
+    assert capsys.readouterr().err.count("tensorboard cannot be used") == 1
+
+
+def test_a_preview_that_cannot_be_written_loses_no_training(scene: Path, tmp_path: Path, edge_se) -> None:
+    config = method_configs()["vanilla-nerf"]
+    changes = {"data": scene, "output_dir": tmp_path / "o", "max_num_iterations": 6, "steps_per_eval_image": 4}
+    trainer = prepare(override(config, changes | {f"{MODEL}.size": "tiny", "machine.device_type": "cpu"}))
+    shutil.rmtree(trainer.run.path / "previews")
+    with pytest.raises(InputError, match="previews"):
+        trainer.train()
+    answer = edge_se("resume", trainer.run.path)
+    assert answer.code == 0, answer.err
+    assert [line["step"] for line in trainer.run.metrics() if "loss" in line] == [0, 5]
+
+
+def test_a_name_that_is_too_long_is_refused_before_the_work(scene: Path, tmp_path: Path) -> None:
+    for length, refused in ((245, False), (246, True)):  # 5 more for the ending, and 5 while it is written
+        with pytest.raises(InputError, match="too long") if refused else nullcontext():
+            check_output(tmp_path / ("a" * length + ".json"), ".json")
+
+
+def test_a_training_that_is_interrupted_before_its_first_step_leaves_no_folder(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("edge_se_sampler.engine.config.TrainerConfig.setup", interrupt)
+    config = override(method_configs()["vanilla-nerf"], {"data": scene, "output_dir": tmp_path / "o"})
+    with pytest.raises(KeyboardInterrupt):
+        prepare(config)
+    assert [path for path in (tmp_path / "o").rglob("*") if path.is_file()] == []

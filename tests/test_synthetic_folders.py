@@ -9,12 +9,15 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from edge_se_sampler.data.synthetic import folder
 from edge_se_sampler.data.synthetic.cameras import FIELD_OF_VIEW, Camera, Placement, Split, framing, poses
 from edge_se_sampler.data.synthetic.catalogue import ANALOG_OF, synthetic_scene
 from edge_se_sampler.data.synthetic.folder import make_scenes
@@ -260,3 +263,16 @@ def test_ctrl_c_stops_quietly(moment: str, tmp_path: Path) -> None:
     assert err == ""
     assert process.returncode == 0
     assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
+
+
+@pytest.mark.parametrize("problem", [MemoryError(), BrokenProcessPool()])
+def test_a_rendering_that_is_killed_is_said_in_a_line(
+    problem: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: object) -> bytes:
+        raise problem
+
+    monkeypatch.setattr(folder, "_render_png", fail)
+    view: Any = None
+    with pytest.raises(InputError, match="smaller --size"):
+        folder._render_all([view], tmp_path, lambda *_: None)

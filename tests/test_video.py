@@ -13,6 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.engine import video
 from edge_se_sampler.engine.video import check_video, write_video
 from edge_se_sampler.errors import InputError
@@ -136,3 +137,14 @@ def test_frames_are_not_collected(name: str, tmp_path: Path, monkeypatch: pytest
 
     write_video(tmp_path / name, stream(), 10)
     assert most <= 4
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "outputs"), [("a.gif", 22_000, 3), ("a.mp4", 6_000, 3), ("a.MP4", 16_385, 1)]
+)
+def test_a_video_that_is_too_wide_is_refused_before_it_is_rendered(name: str, width: int, outputs: int) -> None:
+    cameras = Cameras.of(np.eye(4)[None, :3], fx=9.0, fy=9.0, cx=1.0, cy=1.0, width=width, height=4)
+    with pytest.raises(InputError, match=r"give fewer --outputs"):
+        video._check_size(Path(name), cameras, outputs)
+    smaller = Cameras.of(np.eye(4)[None, :3], fx=9.0, fy=9.0, cx=1.0, cy=1.0, width=width - 1000, height=4)
+    video._check_size(Path(name), smaller, 1)

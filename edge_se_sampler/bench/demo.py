@@ -21,7 +21,7 @@ from edge_se_sampler.bench.train import cached_scene
 from edge_se_sampler.engine.config import override
 from edge_se_sampler.engine.evaluation import evaluate
 from edge_se_sampler.engine.figures import require_pyplot, save_figure
-from edge_se_sampler.engine.files import make_folder, to_uint8, write_atomically, write_json
+from edge_se_sampler.engine.files import check_output, make_folder, to_uint8, write_atomically, write_json
 from edge_se_sampler.engine.frames import render_frame
 from edge_se_sampler.engine.metrics import composite_on, psnr
 from edge_se_sampler.engine.progress import Progress
@@ -48,6 +48,8 @@ def run_demo(output_dir: Path, seed: int) -> dict[str, Any]:
     missing."""
     require_pyplot()
     make_folder(output_dir, "--output-dir")
+    for suffix in (".html", ".png", ".gif", ".json"):
+        check_output(output_dir / f"demo{suffix}", suffix, flag="--output-dir")
     settings = {"scene": SCENE, **SPLITS, "seed": seed, "iterations": ITERATIONS, "time_budget": TIME_BUDGET}
     head = new_result("demo", settings)
     began = time.monotonic()

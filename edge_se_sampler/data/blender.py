@@ -39,7 +39,7 @@ def has_views(folder: Path, split: str) -> bool:
     listed = top.optional("frames")
     if listed is not None and not listed.list():
         return False
-    return any(os.path.exists(entry.image.path) for entry in read_entries(top, folder))
+    return any(entry.image.is_there() for entry in read_entries(top, folder))
 
 
 def is_left_out(folder: Path, split: str) -> bool:

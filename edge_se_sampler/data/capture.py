@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar, get_args
@@ -43,7 +42,7 @@ def keep_existing(
     items: Sequence[Item], images: Sequence[SourceFile], listing: SourceLocation
 ) -> tuple[list[Item], list[str]]:
     """The items whose images exist, and a line about the others, if any; InputError if fewer than half of them do."""
-    exist = [os.path.exists(image.path) for image in images]  # Path.exists() raises where a name is too long
+    exist = [image.is_there() for image in images]
     kept = list(itertools.compress(items, exist))
     if len(kept) == len(items):
         return kept, []

@@ -57,6 +57,16 @@ class SourceFile:
     def error(self, problem: str, hint: str) -> InputError:
         return self.location.error(f"{quote(self.name)} {problem}" if self.name else problem, hint)
 
+    def is_there(self) -> bool:
+        """Whether it exists; InputError if that cannot be seen, as in a folder that may not be read."""
+        try:
+            os.stat(self.path)
+        except PermissionError:
+            raise self.error("cannot be read (permission denied)", "check the permissions") from None
+        except (OSError, ValueError):  # a name that is too long, for one
+            return False
+        return True
+
     def check_regular(self) -> None:
         """InputError for a directory or a pipe, which reading would wait for."""
         if self.path.is_dir():

@@ -19,7 +19,7 @@ from edge_se_sampler.errors import InputError, os_errors_as_input_errors
 def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) -> None:
     """Replace a file's content, by bytes or by what writes it, and flush it to the disk; on failure, and where another
     process has begun to write it meanwhile, leave the file as it was."""
-    temporary, own = path.parent / f".{path.name}.tmp", None
+    temporary, own = _temporary(path), None
 
     def is_own() -> bool:
         return own is not None and os.path.lexists(temporary) and os.path.samestat(own, os.lstat(temporary))
@@ -47,6 +47,11 @@ def write_atomically(path: Path, content: bytes | Callable[[BinaryIO], None]) ->
                 os.close(folder)
 
 
+def _temporary(path: Path) -> Path:
+    """Where a file is written before it takes its place."""
+    return path.parent / f".{path.name}.tmp"
+
+
 def check_output(path: Path, *suffixes: str, flag: str = "--output-path") -> None:
     """Check that a file, named by a flag, can be written: it must end in one of the suffixes, and its folder exist."""
     if not path.name or os.path.isdir(path):
@@ -59,6 +64,8 @@ def check_output(path: Path, *suffixes: str, flag: str = "--output-path") -> Non
         raise InputError(f"{flag} {path}: no such folder {path.parent}")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{flag} {path}: {path.parent} cannot be written")
+    with os_errors_as_input_errors(f"{flag} {path}: cannot be written"), contextlib.suppress(FileNotFoundError):
+        os.lstat(_temporary(path))  # its name may be too long
 
 
 def make_folder(path: Path, flag: str) -> None:

@@ -140,8 +140,13 @@ class EventWriter:
             return
         with os_errors_as_input_errors(f"{self._folder}: TensorBoard's events cannot be written"):
             if self._writer is None:
-                from torch.utils.tensorboard import SummaryWriter
-
+                try:
+                    from torch.utils.tensorboard import SummaryWriter
+                except Exception as problem:  # whatever another version of what it needs does
+                    reason = " ".join(str(problem).split())
+                    print(f"edge-se: tensorboard cannot be used ({reason}): no events are written", file=sys.stderr)
+                    self._can_write = False
+                    return
                 self._writer: Any = SummaryWriter(str(self._folder), purge_step=self._first_step)
                 with contextlib.suppress(AttributeError):  # its thread's failure is raised here: printed once is enough
                     self._writer.file_writer.event_writer._async_writer._worker._invoke_excepthook = lambda _: None

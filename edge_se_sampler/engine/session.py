@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -63,11 +64,19 @@ def prepare(
         disable_malloc_trimming()
     began = time.monotonic()
     pipeline = Pipeline.build(config, views, device, grid, changed_data=changed_data)
-    run = run or ranks.share(lambda: RunFolder.create(config))
     setup_seconds += time.monotonic() - began
     if preview is not None and ranks.is_main():
         _compare_alpha(config, views, preview)
-    return config.setup(run=run, pipeline=pipeline, preview=preview, setup_seconds=setup_seconds)
+    setup = {"pipeline": pipeline, "preview": preview, "setup_seconds": setup_seconds}
+    if run is not None:
+        return config.setup(run=run, **setup)
+    run = ranks.share(lambda: RunFolder.create(config))
+    try:
+        return config.setup(run=run, **setup)
+    except BaseException:  # Ctrl-C, for one
+        if ranks.is_main():
+            shutil.rmtree(run.path, ignore_errors=True)
+        raise
 
 
 def resolve_config(config: TrainerConfig, views: Views) -> TrainerConfig:
@@ -268,16 +277,18 @@ def describe_run(trainer: Trainer) -> str:
     """Where a run is written, its model, its length and its sampling."""
     config, manager = trainer.config, trainer.pipeline.datamanager.config
     model, sampler = config.pipeline.model, manager.pixel_sampler
-    samples = "samples in occupied cells"
     if isinstance(model, NeRFModelConfig):
+        width = model.preset.width
         samples = f"{model.num_coarse_samples} + {model.num_importance_samples} samples a ray"
+    else:
+        width, samples = trainer.pipeline.model.fine.hidden.shape[1], "samples in occupied cells"
     plan = f"{trainer.plan.num_steps} iterations" if config.time_budget is None else f"{config.budget_seconds:.0f} s"
     lines = [
         f"run      {trainer.run.path}",
         f"data     {trainer.pipeline.data_summary}",
         *[f"memory   {trainer.pipeline.memory_summary}"] * bool(trainer.pipeline.memory_summary),
         f"depths   {model.near:g} to {model.far:g}",
-        f"model    {model.size}: {model.preset.depth} x {model.preset.width}, {samples}",
+        f"model    {model.size}: {model.preset.depth} x {width}, {samples}",
         f"plan     {plan} of {manager.train_num_rays_per_batch} rays a step",
     ]
     if isinstance(model, LeanModelConfig):

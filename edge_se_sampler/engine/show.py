@@ -21,6 +21,9 @@ from edge_se_sampler.sampling.random_streams import Stream, stream
 from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
 from edge_se_sampler.sampling.settings import EdgeSEPixelSamplerConfig
 
+MOST_VIEWS = 100
+"""A figure of more is larger than matplotlib draws."""
+
 
 def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np.ndarray:
     """Probability of every pixel of the kth view, (H, W); it sums to 1, or to 0 if all pixels are masked."""
@@ -37,14 +40,14 @@ def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np
 
 
 def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Path, num_views: int, seed: int) -> None:
-    """Draw num_views of the training views, evenly spaced, with num_rays_per_batch drawn pixels each, as a PNG.
-    InputError if matplotlib is missing, or the settings do not fit the images."""
+    """Draw num_views of the training views, MOST_VIEWS at most, evenly spaced, each with num_rays_per_batch drawn pixels,
+    as a PNG. InputError if matplotlib is missing, or the settings do not fit the images."""
     pyplot = require_pyplot()
     config.check()
     distribution = PIXEL_STRATEGIES[strategy].load()(config)
     batch = ImageBatch.of(image_batch(views), use_mask=not config.ignore_mask)
     last = len(views.images) - 1
-    chosen = np.unique(np.linspace(0, last, min(num_views, last + 1)).round().astype(int)).tolist()
+    chosen = np.unique(np.linspace(0, last, min(num_views, last + 1, MOST_VIEWS)).round().astype(int)).tolist()
     figure, axes = pyplot.subplots(len(chosen), 3, figsize=(9.6, 3.35 * len(chosen)), squeeze=False)
     for row, k in zip(axes, chosen, strict=True):
         try:

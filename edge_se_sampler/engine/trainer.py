@@ -130,14 +130,19 @@ class Trainer:
                 self.elapsed, stopping = ranks.agree(time.monotonic() - began, stopping)
                 plan.decide(self.next_step, self.setup_seconds + self.elapsed)
                 ended = self.next_step == plan.num_steps
-                if ended or step % config.steps_per_log == 0:
-                    strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
-                    self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
-                if ended or self._preview_is_due():
-                    with self.turns:
-                        self._preview(step)
-                    stopping = ranks.share(lambda: self.early_stopping.is_due) or stopping
-                    began = time.monotonic() - self.elapsed  # a preview is not training time
+                try:
+                    if ended or step % config.steps_per_log == 0:
+                        strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
+                        self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
+                    if ended or self._preview_is_due():
+                        with self.turns:
+                            self._preview(step)
+                        stopping = ranks.share(lambda: self.early_stopping.is_due) or stopping
+                        began = time.monotonic() - self.elapsed  # a preview is not training time
+                except InputError:  # what was learned is worth more than a picture that cannot be written
+                    with suppress(InputError):
+                        self.save()
+                    raise
                 if ended or stopping or self.next_step % config.steps_per_save == 0:
                     self.save()
                 total = plan.num_steps or round(self.next_step / max(plan.progress(self.next_step), 1e-3))

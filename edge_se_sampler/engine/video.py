@@ -83,6 +83,7 @@ def render_run(
     depths = None if path is None else find_depth_range(model, cameras)  # of a path all is shown that a viewer shows
     unit = choose_depth_unit((depths or model.config.depths)[1], depth_unit)
     if output_path.suffix:
+        _check_size(output_path, cameras, len(outputs))
         write_video(output_path, _video_frames(model, cameras, outputs, unit, depths), rate)
     else:
         write_frames(output_path, model, cameras, outputs, unit, checkpoints, depths)
@@ -118,22 +119,34 @@ def check_video(path: Path, outputs: Sequence[str], frames_per_second: float) ->
             raise InputError("mp4 needs the [video] extra: pip install 'edge-se-sampler[video]', or use .gif") from None
 
 
+MOST_PIXELS = {".gif": 2**16 - 1, ".mp4": 2**14}
+"""Along each side of a video: what the format holds, and what encoders take."""
+
+
 def _video_frames(
     model: RayModel, cameras: Cameras, outputs: Sequence[str], unit: float, depths: tuple[float, float] | None
 ) -> Iterator[np.ndarray]:
-    """(H, W, 3) uint8 frames of `render_frame`, one after another, outputs side by side. InputError if they differ in
-    size."""
-    (height, width), *others = torch.unique(torch.cat((cameras.height, cameras.width), dim=1), dim=0).tolist()
-    if others:
-        raise InputError("the views differ in size and make no video; give --output-path a folder (no ending)")
-    if min(height, width) < 2:
-        raise InputError("the views are 1 pixel wide or high, which is no video")
+    """(H, W, 3) uint8 frames of `render_frame`, one after another, outputs side by side."""
+    height, width = int(cameras.height[0]), int(cameras.width[0])
     with Progress(len(cameras), "rendering") as progress:
         for i in range(len(cameras)):
             images = render_frame(model, cameras, i, outputs, unit, depths)
             channels = (np.broadcast_to(np.atleast_3d(images[name]), (height, width, 3)) for name in outputs)
             yield np.concatenate(list(channels), axis=1)
             progress.update(i + 1)
+
+
+def _check_size(path: Path, cameras: Cameras, num_outputs: int) -> None:
+    """InputError if so many outputs of cameras side by side make no video."""
+    (height, width), *others = torch.unique(torch.cat((cameras.height, cameras.width), dim=1), dim=0).tolist()
+    if others:
+        raise InputError("the views differ in size and make no video; give --output-path a folder (no ending)")
+    if min(height, width) < 2:
+        raise InputError("the views are 1 pixel wide or high, which is no video")
+    suffix, width = path.suffix.lower(), width * num_outputs
+    if max(height, width) > MOST_PIXELS[suffix]:
+        most = f"{width} x {height} pixels are more than the {MOST_PIXELS[suffix]} a side of a {suffix[1:]}"
+        raise InputError(f"{most}: give fewer --outputs, or --output-path a folder (no ending)")
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:

@@ -14,7 +14,7 @@ from edge_se_sampler.data.camera_path import read_applied
 from edge_se_sampler.data.capture import SPLITS
 from edge_se_sampler.data.dataset import DataSettings, find_format, list_frames
 from edge_se_sampler.data.frames import DYNAMIC_MASK, Frame, read_mask
-from edge_se_sampler.data.scene_file import SourceFile
+from edge_se_sampler.data.scene_file import SourceFile, read_json
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
 from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
@@ -22,6 +22,8 @@ from edge_se_sampler.engine.session import check_run_data, select_views
 from edge_se_sampler.errors import InputError
 
 POINTS_NAME = "points.ply"
+EXPORTER = {"exported_by": "edge-se export"}
+"""Tells the file from others of its name, which are not replaced; nerfstudio does not read it."""
 
 
 def export_cameras(config: TrainerConfig, path: Path) -> str:
@@ -39,6 +41,8 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     others = [other for paths in lists.values() for other in paths if other.exists()]  # of the same images
     if os.path.realpath(path) in map(os.path.realpath, (*own, *others)):
         raise InputError(f"--output-path {path}: the data itself, which is not overwritten; give another file")
+    if path.exists() and not _is_export(path):
+        raise InputError(f"--output-path {path}: is none that was exported here, and would be replaced; name another")
     settings = DataSettings(config.data_format, eval_every=config.eval_every)
     splits = {split: list_frames(config.data, split, settings) for split in SPLITS}
     selected = select_views(config, len(splits["train"]))
@@ -51,7 +55,7 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     num_written = _write_masks(listed, frames, path)
     motion, scale = read_applied(config.data, config.data_format)
     applied = {"applied_transform": motion[:3].tolist(), "applied_scale": scale}
-    content = applied | share_intrinsics(list(frames.values()))
+    content = EXPORTER | applied | share_intrinsics(list(frames.values()))
     for split in SPLITS if splits["test"] else ():  # nerfstudio wants all lists or none
         content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
     line = f"{path}: {len(frames)} cameras, {len(splits['train'])} of them to train on"
@@ -67,6 +71,13 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
         line += f"; the {POINTS_NAME} that lies beside it is named as their points"
     write_json(path, content)
     return line
+
+
+def _is_export(path: Path) -> bool:
+    try:
+        return read_json(path).object().items() >= EXPORTER.items()
+    except InputError:
+        return False
 
 
 def describe_frame(frame: Frame, folder: Path) -> dict[str, Any]:
@@ -118,7 +129,7 @@ def _is_plain(mask: SourceFile) -> bool:
     try:
         with Image.open(mask.path) as image:
             gray = image.format == "PNG" and image.mode in ("1", "L")
-    except OSError:  # reading it says what is wrong
+    except Exception:  # OSError, DecompressionBombError, ...: reading it says what is wrong
         return False
     return gray and not os.path.basename(mask.name).startswith(DYNAMIC_MASK)
 

@@ -7,7 +7,7 @@ import math
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -123,9 +123,13 @@ def _render_all(views: Sequence[_View], workspace: Path, progress: Callable[[int
                 stack.callback(pool.shutdown, cancel_futures=True)
                 with interrupts_blocked():
                     pictures = pool.map(_render_png, views)
-        for done, (view, png) in enumerate(zip(views, pictures, strict=True), start=1):
-            (workspace / view.scene / f"{view.file}.png").write_bytes(png)
-            progress(done, len(views))
+        try:
+            for done, (view, png) in enumerate(zip(views, pictures, strict=True), start=1):
+                (workspace / view.scene / f"{view.file}.png").write_bytes(png)
+                progress(done, len(views))
+        except (BrokenExecutor, MemoryError) as problem:
+            killed = "a process that rendered was killed, as where memory is too little"
+            raise InputError(f"{killed}: give a smaller --size") from problem
 
 
 def _render_png(view: _View) -> bytes:
