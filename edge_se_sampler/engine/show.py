@@ -40,7 +40,7 @@ def probability_map(distribution: Distribution, batch: ImageBatch, k: int) -> np
 
 
 def show(views: Views, config: EdgeSEPixelSamplerConfig, strategy: str, path: Path, num_views: int, seed: int) -> None:
-    """Draw num_views of the training views, MOST_VIEWS at most, evenly spaced, each with num_rays_per_batch drawn pixels,
+    """Draw num_views of the training views, MOST_VIEWS at most, evenly spaced, with num_rays_per_batch pixels each,
     as a PNG. InputError if matplotlib is missing, or the settings do not fit the images."""
     pyplot = require_pyplot()
     config.check()
