@@ -20,7 +20,7 @@ from edge_se_sampler.engine.config import SAMPLER, override
 from edge_se_sampler.engine.rendering import render_rays
 from edge_se_sampler.engine.trainer import Trainer
 from edge_se_sampler.models import voxel_ops
-from edge_se_sampler.models.lean import ColorNetwork
+from edge_se_sampler.models.lean import WIDTH_CARVED, ColorNetwork
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans
 from edge_se_sampler.occupancy.bricks import BrickGrid
 from edge_se_sampler.sampling.registry import PIXEL_STRATEGIES
@@ -74,7 +74,7 @@ def test_samples_colors_and_gradients_of_the_cells_are_the_cpu_s() -> None:
         density = torch.from_numpy(values.normal(size=(grid.num_rows, 1)) * 2 - 1).float()
         features = torch.from_numpy(values.normal(size=(grid.num_rows, 16))).float()
         density, features = (value.to(device).requires_grad_() for value in (density, features))
-        weights = ColorNetwork(np.random.default_rng(0)).to(device).weights()
+        weights = ColorNetwork(np.random.default_rng(0), WIDTH_CARVED).to(device).weights()
         spans = RaySpans(*(value.to(device) for value in (origins, directions, begin, end)))
         marching = Marching(0.7, 1.0, 0.012, 0.006, 0.01, 0.4)
         rendered = voxel_ops.render(grid, density, features, weights, spans, jitter.to(device), marching)

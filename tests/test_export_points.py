@@ -222,7 +222,8 @@ def test_an_interrupted_export_leaves_the_file_that_was_there(
     kind: str, tmp_path: Path, edge_se: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, path = ball_run(tmp_path), tmp_path / f"out.{'json' if kind == 'cameras' else 'ply'}"
-    path.write_text("before")
+    before = '{"exported_by": "edge-se export"}'  # or it would not be replaced
+    path.write_text(before)
     names = sorted(tmp_path.iterdir())
 
     def interrupt(_: int) -> None:
@@ -231,7 +232,7 @@ def test_an_interrupted_export_leaves_the_file_that_was_there(
     with monkeypatch.context() as patched:
         patched.setattr("edge_se_sampler.engine.files.os.fsync", interrupt)
         assert edge_se("export", run, kind, "--output-path", path).code == 130
-    assert path.read_text() == "before"
+    assert path.read_text() == before
     assert sorted(tmp_path.iterdir()) == names
     assert edge_se("export", run, kind, "--output-path", path).code == 0
-    assert path.read_bytes() != b"before"
+    assert path.read_bytes() != before.encode()

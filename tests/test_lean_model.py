@@ -15,7 +15,9 @@ from tiny import ball_views, tiny_rays, tiny_trainer
 
 from edge_se_sampler.data.cameras import RayBundle
 from edge_se_sampler.data.views import Views
+from edge_se_sampler.engine.pipeline import load_weights
 from edge_se_sampler.engine.rendering import render_outputs, render_rays
+from edge_se_sampler.errors import InputError
 from edge_se_sampler.models import lean, voxel_backend, voxel_ops
 from edge_se_sampler.models.config import LeanModelConfig
 from edge_se_sampler.models.lean import INITIAL_DEPTH_CARVED, INITIAL_RAW_DENSITY, LeanModel
@@ -71,6 +73,34 @@ def test_the_fog_of_carved_cells_is_dense_but_for_very_small_ones(max_level: int
     grid.is_carved_close = True
     carved = LeanModel(LeanModelConfig(size="tiny"), np.random.default_rng(0), grid)
     torch.testing.assert_close(carved.density.detach(), torch.full((len(carved.density), 1), expected))
+
+
+@pytest.mark.parametrize(("is_carved", "width"), [(True, 128), (False, 64)])
+def test_the_network_is_wide_where_masks_show_an_object(is_carved: bool, width: int) -> None:
+    """And as wide in what is loaded, whose grid does not say what carved it."""
+    config, cells = LeanModelConfig(size="tiny"), torch.ones((8, 8, 8), dtype=torch.bool)
+    grid, same = (BrickGrid.from_cells(torch.full((3,), -1.0), 0.25, cells, 2) for _ in range(2))
+    grid.is_carved_close = is_carved
+    model, loaded = (LeanModel(config, np.random.default_rng(i), g).eval() for i, g in enumerate((grid, same)))
+    weights = [*loaded.fine.parameters()]
+    load_weights(loaded, model.state_dict())
+    assert model.fine.hidden.shape == loaded.fine.hidden.shape == (16, width)
+    assert [id(weight) for weight in loaded.fine.parameters()] == [id(weight) for weight in weights]  # an optimizer's
+    rays = tiny_rays(50, dtype=torch.float32)
+    found, expected = (render_outputs(m, rays, ["rgb_fine"])["rgb_fine"] for m in (loaded, model))
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("width", [63, 192])
+def test_a_network_of_another_width_is_refused(width: int) -> None:
+    """Kernels would read beyond its end."""
+    model = full_model()
+    state = model.state_dict()
+    for name in ("hidden", "view", "view_bias", "color"):
+        value = state[f"fine.{name}"]
+        state[f"fine.{name}"] = value.new_zeros((*value.shape[:-1], width))
+    with pytest.raises(InputError, match="not this model's"):
+        load_weights(model, state)
 
 
 @pytest.mark.parametrize("changes", [{"step_size_voxels": 0.05}, {"alpha_threshold": 0.2}])

@@ -140,7 +140,7 @@ def test_depths_are_those_of_what_is_seen_whatever_is_behind(viewed: Viewed) -> 
     for far in (model.config.depths[1], 1000.0):
         model.config = replace(model.config, far=far)
         pictures.append(Renderer(viewed).picture(camera, "depth", lambda: False))
-    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_allclose(*pictures, atol=4)  # a depth may round to the next color
 
 
 def test_a_view_of_a_training_camera_has_its_rays() -> None:

@@ -20,7 +20,7 @@ from edge_se_sampler.engine.config import MANAGER, MODEL, TrainerConfig, overrid
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models import compilation, voxel_backend, voxel_kernels, voxel_ops
 from edge_se_sampler.models.compilation import compile_ops
-from edge_se_sampler.models.lean import ColorNetwork
+from edge_se_sampler.models.lean import WIDTH, WIDTH_CARVED, ColorNetwork
 from edge_se_sampler.models.voxel_kernels import rendering
 from edge_se_sampler.models.voxel_ops import Marching, RaySpans, Rendered
 from edge_se_sampler.occupancy.bricks import BrickGrid, unpack_bits
@@ -62,7 +62,7 @@ def jitter() -> torch.Tensor:
 
 def render(ops: ModuleType, marching: Marching = MARCHING) -> Rendered:
     grid = shell()
-    weights = ColorNetwork(np.random.default_rng(0)).weights()
+    weights = ColorNetwork(np.random.default_rng(0), WIDTH).weights()
     density, features = random_tensor(grid.num_rows, 1) * 2 - 1, random_tensor(grid.num_rows, 16, seed=5)
     return ops.render(grid, density, features, weights, crossing_spans(), jitter(), marching)
 
@@ -103,7 +103,7 @@ def test_rays_end_where_no_light_passes() -> None:
 def test_cells_that_are_too_thin_to_be_seen_need_not_be_sampled(ops: ModuleType) -> None:
     grid, rays = shell(), (crossing_spans(), jitter(), MARCHING)
     density, features = 2 * random_tensor(grid.num_rows, 1) - 7, random_tensor(grid.num_rows, 16, seed=5)
-    weights = ColorNetwork(np.random.default_rng(0)).weights()
+    weights = ColorNetwork(np.random.default_rng(0), WIDTH).weights()
     rendered = ops.render(grid, density, features, weights, *rays)
     dense = ops.find_dense_cells(grid, density, MARCHING.density_min)
     corners = grid.corner_rows(*torch.nonzero(grid.occupied, as_tuple=True))
@@ -127,7 +127,7 @@ def test_more_samples_than_were_made_room_for_are_found_in_a_second_round(monkey
 
 
 def test_two_renderings_before_a_backward_pass_do_not_share_memory() -> None:
-    grid, network = shell(), ColorNetwork(np.random.default_rng(0))
+    grid, network = shell(), ColorNetwork(np.random.default_rng(0), WIDTH)
     density = torch.nn.Parameter(random_tensor(grid.num_rows, 1) * 2 - 1)
     features = torch.nn.Parameter(random_tensor(grid.num_rows, 16, seed=5))
 
@@ -154,7 +154,7 @@ def test_densities_that_little_light_reaches_have_no_gradient(ops: ModuleType) -
     features = torch.nn.Parameter(random_tensor(grid.num_rows, 16, seed=5))
     ray = RaySpans(torch.full((1, 3), 0.5), torch.eye(3)[:1], torch.zeros(1), torch.full((1,), 11.5))
     marching = Marching(1.0, 1.0, 0.01, 0.0, 0.0, visible_min=0.1)
-    weights = ColorNetwork(np.random.default_rng(0)).weights()
+    weights = ColorNetwork(np.random.default_rng(0), WIDTH).weights()
     rendered = ops.render(grid, density, features, weights, ray, torch.zeros(1), marching)
     (rendered.rgb.sum() + rendered.accumulation.sum()).backward()
     for values, last in ((density, 5), (features, 12)):
@@ -165,9 +165,9 @@ def test_densities_that_little_light_reaches_have_no_gradient(ops: ModuleType) -
         assert sorted(set(cells.tolist())) == list(range(last + 1))
 
 
-def gradients_of(ops: ModuleType) -> dict[str, torch.Tensor]:
+def gradients_of(ops: ModuleType, width: int = WIDTH) -> dict[str, torch.Tensor]:
     """What is rendered, and gradients of everything that is trained, sparse ones made dense."""
-    grid, network = shell(), ColorNetwork(np.random.default_rng(0))
+    grid, network = shell(), ColorNetwork(np.random.default_rng(0), width)
     raw = torch.nn.Parameter(random_tensor(grid.num_rows, 1) * 2 - 1)
     features = torch.nn.Parameter(random_tensor(grid.num_rows, 16, seed=5))
     rendered = ops.render(grid, raw, features, network.weights(), crossing_spans(), jitter(), MARCHING)
@@ -181,10 +181,11 @@ def gradients_of(ops: ModuleType) -> dict[str, torch.Tensor]:
     return dense | {name: value.detach() for name, value in vars(rendered).items()}
 
 
+@pytest.mark.parametrize("width", [WIDTH, WIDTH_CARVED])
 @pytest.mark.parametrize("num_sums", [2, 32])
-def test_colors_and_gradients_are_the_reference_s(num_sums: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colors_and_gradients_are_the_reference_s(num_sums: int, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rendering, "NUM_SUMS", num_sums)  # of five chunks of rays
-    found, expected = gradients_of(voxel_kernels), gradients_of(voxel_ops)
+    found, expected = gradients_of(voxel_kernels, width), gradients_of(voxel_ops, width)
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         assert float(value.abs().max()) > 1e-3, name

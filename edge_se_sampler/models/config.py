@@ -57,9 +57,9 @@ NERF_PRESETS = {
     "tiny": SizePreset(96, 2, 6, 2, 3e-3, 512, 1_500, num_coarse_samples=32, num_importance_samples=32),
 }
 LEAN_PRESETS = {
-    "paper": SizePreset(64, 1, 0, 0, 7e-3, 8192, 7_000),
-    "small": SizePreset(64, 1, 0, 0, 7e-3, 4096, 5_000),
-    "tiny": SizePreset(64, 1, 0, 0, 7e-3, 2048, 4_000),
+    "paper": SizePreset(64, 1, 0, 0, 2.8e-2, 8192, 7_000),
+    "small": SizePreset(64, 1, 0, 0, 2.8e-2, 4096, 5_000),
+    "tiny": SizePreset(64, 1, 0, 0, 2.8e-2, 2048, 4_000),
 }
 
 
@@ -211,9 +211,9 @@ class LeanModelConfig(ModelConfig):
     through would make opaque what is behind it, which other views may see beside it."""
     prune_weight: float = 0.04
     """Cells that never counted more in a ray's color are pruned."""
-    density_lr_scale: float = 30.0
+    density_lr_scale: float = 7.5
     """Learning rate of the density, as a multiple of the network's."""
-    feature_lr_scale: float = 20.0
+    feature_lr_scale: float = 3.6
     """Learning rate of the features, as a multiple of the network's."""
     total_variation: float = 1e-5
     """How much, beside a ray's squared error, squared differences between features of neighboring corners count."""

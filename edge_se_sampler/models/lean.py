@@ -31,8 +31,11 @@ from edge_se_sampler.occupancy.subdivision import subdivide
 from edge_se_sampler.occupancy.visibility import find_empty_depths
 from edge_se_sampler.protocol import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 
-FEATURE_DIM, WIDTH = 16, 64
-"""Features at a corner, and neurons of the hidden layer. The compiled kernels know no others."""
+FEATURE_DIM = 16
+"""Features at a corner. The compiled kernels know no other number."""
+WIDTH, WIDTH_CARVED = 64, 128
+"""Neurons of the hidden layer; the latter where masks carve cells close to the object. In photographs of more than an
+object colors differ from image to image, which a wider one would learn by heart. Kernels want a multiple of 64."""
 INITIAL_RAW_DENSITY, MAX_RAW_DENSITY = -3.0, 5.0
 """The most at first, if that is sampled, and at all: denser is as opaque, and slow to become transparent again."""
 INITIAL_DEPTH, INITIAL_DEPTH_CARVED = 1.0, 8.5
@@ -69,17 +72,27 @@ BYTES_PER_ROW = 4 * (2 * (FEATURE_DIM + 1) + 4) + 1
 
 
 class ColorNetwork(nn.Module):
-    """The weights of `voxel_ops.shade`'s network. `rng` draws the initial ones."""
+    """The weights of `voxel_ops.shade`'s network of so many neurons, or of as many as a checkpoint has. `rng` draws the
+    initial ones."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, width: int) -> None:
         super().__init__()
 
         def draw(shape: tuple[int, int], variance: float) -> nn.Parameter:
             return nn.Parameter(torch.from_numpy(rng.normal(size=shape) * math.sqrt(variance)).float())
 
-        self.hidden = draw((FEATURE_DIM, WIDTH), 2 / FEATURE_DIM)
-        self.view, self.view_bias = draw((NUM_HARMONICS, WIDTH), 0.5 / NUM_HARMONICS), nn.Parameter(torch.zeros(WIDTH))
-        self.color, self.color_bias = draw((3, WIDTH), 1 / WIDTH), nn.Parameter(torch.zeros(3))
+        self.hidden = draw((FEATURE_DIM, width), 2 / FEATURE_DIM)
+        self.view, self.view_bias = draw((NUM_HARMONICS, width), 0.5 / NUM_HARMONICS), nn.Parameter(torch.zeros(width))
+        self.color, self.color_bias = draw((3, width), 1 / width), nn.Parameter(torch.zeros(3))
+
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        state, prefix = arguments[:2]
+        bias = state.get(f"{prefix}view_bias")
+        for width in (WIDTH, WIDTH_CARVED):
+            if bias is not None and bias.shape == (width,):
+                for weight in (self.hidden, self.view, self.view_bias, self.color):
+                    weight.data = weight.data.new_zeros((*weight.shape[:-1], width))
+        super()._load_from_state_dict(*arguments, **options)
 
     def weights(self) -> NetworkWeights:
         return NetworkWeights(self.hidden, self.view, self.view_bias, self.color, self.color_bias)
@@ -99,7 +112,7 @@ class LeanModel(RayModel):
 
     def __init__(self, config: LeanModelConfig, rng: np.random.Generator, grid: BrickGrid) -> None:
         super().__init__(config, grid)
-        self.fine = ColorNetwork(rng)
+        self.fine = ColorNetwork(rng, WIDTH_CARVED if grid.is_carved_close else WIDTH)
         depth = INITIAL_DEPTH_CARVED if grid.is_carved_close else INITIAL_DEPTH
         thin = math.log(depth / float(grid.size.max())) - int(grid.max_level) * math.log(2)
         # samples of less would be left out

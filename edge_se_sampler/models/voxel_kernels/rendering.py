@@ -13,7 +13,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from edge_se_sampler.models.voxel_kernels.buffers import CHUNK, FEATURES, HARMONICS, WIDTH, Buffers
+from edge_se_sampler.models.voxel_kernels.buffers import CHUNK, FEATURES, HARMONICS, Buffers
 from edge_se_sampler.models.voxel_kernels.marching import Cells, Rays, march_chunk
 from edge_se_sampler.models.voxel_kernels.rows import interpolate, sum_row_gradients
 from edge_se_sampler.models.voxel_kernels.shading import (
@@ -61,7 +61,7 @@ class _Render(torch.autograd.Function):
         slots = chunks if keep else min(chunks, 4 * numba.get_num_threads())
         samples = CHUNK * SAMPLES_PER_RAY
         while True:
-            buffers = _take(slots, samples)
+            buffers = _take(slots, samples, len(network.hidden_bias))
             outputs = [np.empty((len(rays.begin), size), np.float32) for size in (3, 1, 1)]
             found = _render(rays, cells, features.detach().numpy().reshape(-1), network, buffers, *outputs)
             if found < buffers.t.shape[1]:  # beside those found, one that is looked at
@@ -81,24 +81,25 @@ class _Render(torch.autograd.Function):
         accumulation, network, buffers = ctx.arrays
         d_rgb, d_accumulation = (gradient.contiguous().numpy() for gradient in gradients[:2])
         of_network = network.zeros(min(len(buffers.ends), NUM_SUMS))
-        transposed = network.hidden.reshape(FEATURES, WIDTH).T.ravel()
+        width = len(network.hidden_bias)
+        transposed = network.hidden.reshape(FEATURES, width).T.ravel()
         of_rays = d_rgb, d_accumulation, accumulation
         _render_backward(*of_rays, ctx.visible_min, network, transposed, buffers, of_network)
         of_rows = sum_row_gradients(buffers, ctx.num_rows)
         del ctx.arrays  # the buffers hold gradients now: there is no second backward pass
         _spare.append(buffers)
-        shapes = (FEATURES, WIDTH), (HARMONICS, WIDTH), (WIDTH,), (3, WIDTH), (3,)
+        shapes = (FEATURES, width), (HARMONICS, width), (width,), (3, width), (3,)
         of_weights = (torch.from_numpy(value.sum(0)).reshape(s) for value, s in zip(of_network, shapes, strict=True))
         return None, None, None, None, None, *of_rows, *of_weights
 
 
-def _take(slots: int, samples: int) -> Buffers:
-    """Buffers with that many slots, and room for at least so many samples."""
+def _take(slots: int, samples: int, width: int) -> Buffers:
+    """Buffers with that many slots, room for at least so many samples, and so many neurons."""
     while _spare:
         buffers = _spare.pop()
-        if buffers.t.shape[0] == slots and buffers.t.shape[1] >= samples:
+        if buffers.of_ray.shape == (slots, width * CHUNK) and buffers.t.shape[1] >= samples:
             return buffers
-    return Buffers.allocate(slots, samples)
+    return Buffers.allocate(slots, samples, width)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")
@@ -123,6 +124,7 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
     view, harmonics, hidden = buffers.of_ray[slot], buffers.harmonics[slot], buffers.hidden[slot]
     rows, weights, color_index = buffers.rows[slot], buffers.weights[slot], buffers.color_index[slot]
     ends, color, of_samples = buffers.ends[slot], buffers.color[slot], buffers.features[slot]
+    width = len(network.hidden_bias)
     for k in range(ends[-1]):
         if color_index[k] >= 0:
             interpolate(features, rows, weights, 8 * k, of_samples, FEATURES * color_index[k])
@@ -137,7 +139,7 @@ def _shade_chunk(rays, first, features, network, buffers, slot):
                 i, seen = first + ray, True
                 x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
                 start_ray(x, y, z, network, harmonics, view, ray)
-            find_hidden(of_samples, network.hidden, view, ray, hidden, index)
+            find_hidden(of_samples, network.hidden, width, view, ray, hidden, index)
         start = end
     find_colors(hidden, buffers.num_colored[slot], network.color, network.color_bias, color)
 
@@ -211,7 +213,7 @@ def _composite_chunk_backward(slot, d_rgb, d_accumulation, accumulation, visible
 def _shade_chunk_backward(slot, number, network, transposed, buffers, gradient):
     start, color = 0, buffers.color[slot]
     features, harmonics = buffers.features[slot], buffers.harmonics[slot]
-    hidden, view = buffers.hidden[slot], buffers.of_ray[slot]
+    hidden, view, width = buffers.hidden[slot], buffers.of_ray[slot], len(network.hidden_bias)
     rays = 0  # those with a color, without gaps
     for ray in range(CHUNK):
         seen = False
@@ -221,14 +223,14 @@ def _shade_chunk_backward(slot, number, network, transposed, buffers, gradient):
                 continue
             if not seen:
                 seen = True
-                view[WIDTH * rays : WIDTH * rays + WIDTH] = f32(0)
+                view[width * rays : width * rays + width] = f32(0)
                 for h in range(HARMONICS):
                     harmonics[HARMONICS * rays + h] = harmonics[HARMONICS * ray + h]
             red, green, blue = color[3 * index], color[3 * index + 1], color[3 * index + 2]
             gradient.color_bias[number, 0] += red
             gradient.color_bias[number, 1] += green
             gradient.color_bias[number, 2] += blue
-            shade_backward(red, green, blue, hidden, view, rays, index, network.color, gradient.color[number])
+            shade_backward(red, green, blue, hidden, view, rays, index, width, network.color, gradient.color[number])
         rays += seen
         start = buffers.ends[slot, ray]
     count = buffers.num_colored[slot]
