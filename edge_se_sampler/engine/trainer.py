@@ -130,7 +130,7 @@ class Trainer:
                 self.elapsed, stopping = ranks.agree(time.monotonic() - began, stopping)
                 plan.decide(self.next_step, self.setup_seconds + self.elapsed)
                 ended = self.next_step == plan.num_steps
-                try:
+                with self._saved_if_it_fails():
                     if ended or step % config.steps_per_log == 0:
                         strategy = getattr(self.pipeline.datamanager.train_pixel_sampler, "strategy", None)
                         self._record(step, loss=loss, learning_rate=learning_rate, strategy=strategy)
@@ -139,10 +139,6 @@ class Trainer:
                             self._preview(step)
                         stopping = ranks.share(lambda: self.early_stopping.is_due) or stopping
                         began = time.monotonic() - self.elapsed  # a preview is not training time
-                except InputError:  # what was learned is worth more than a picture that cannot be written
-                    with suppress(InputError):
-                        self.save()
-                    raise
                 if ended or stopping or self.next_step % config.steps_per_save == 0:
                     self.save()
                 total = plan.num_steps or round(self.next_step / max(plan.progress(self.next_step), 1e-3))
@@ -254,6 +250,16 @@ class Trainer:
             self.early_stopping.update(self._preview_psnr)
             self._record(step, val_psnr=self._preview_psnr)
             write_image(self.run.path / "previews" / f"step-{step:09d}.png", rendered)
+
+    @contextmanager
+    def _saved_if_it_fails(self) -> Iterator[None]:
+        """What was learned is worth more than a line or a picture that cannot be written."""
+        try:
+            yield
+        except InputError:
+            with suppress(InputError):
+                self.save()
+            raise
 
     def _status(self, loss: float) -> str:
         rate = self.next_step * self.config.preset.rays / self.elapsed

@@ -88,10 +88,9 @@ class ColorNetwork(nn.Module):
     def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
         state, prefix = arguments[:2]
         bias = state.get(f"{prefix}view_bias")
-        for width in (WIDTH, WIDTH_CARVED):
-            if bias is not None and bias.shape == (width,):
-                for weight in (self.hidden, self.view, self.view_bias, self.color):
-                    weight.data = weight.data.new_zeros((*weight.shape[:-1], width))
+        if bias is not None and bias.shape in ((WIDTH,), (WIDTH_CARVED,)):  # others are refused below
+            for weight in (self.hidden, self.view, self.view_bias, self.color):
+                weight.data = weight.data.new_zeros((*weight.shape[:-1], len(bias)))
         super()._load_from_state_dict(*arguments, **options)
 
     def weights(self) -> NetworkWeights:

@@ -50,7 +50,9 @@ MODELS = {
     "nerfacto": "nerfstudio 1.1.5's, much smaller than its own settings and, but for captures, at learning rates of "
     "3e-3, inside nerfstudio",
 }
+"""What is trained, in words."""
 EQUAL = {"seconds": "at equal CPU seconds", "steps": "at equal steps"}
+"""What a plan compares at, in words."""
 
 
 def draw(folder: Path, workplace: Path | None) -> None:
@@ -111,7 +113,9 @@ def _list_models(runs: list[Run], settings: dict[str, dict[str, Any]]) -> str:
     for model, text in MODELS.items():
         plans = {run["plan"] for run in runs if run["model"] == model}
         length = settings["lean" if model.startswith("lean") else "nerf"]
-        lengths = [f"{length[plan]} {unit}" for plan, unit in (("seconds", "s"), ("steps", "steps")) if plan in plans]
+        lengths = [
+            f"{length[plan]} {unit}" for plan, unit in {"seconds": "s", "steps": "steps"}.items() if plan in plans
+        ]
         if lengths:
             lines.append(f"- `{model}`: {text}; {' or '.join(lengths)}")
     return "\n".join(lines)
