@@ -16,6 +16,7 @@ need not be monotone), so that a seed draws the same pixels everywhere.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -99,12 +100,15 @@ class PixelTable:
         Raises:
             ValueError: a strength that is negative or not finite, or an image without pixels.
         """
-        mass, blocks, pixels, shapes = [self._mass], [self._blocks], [self._pixels], []
+        mass, blocks, pixels, shapes = [self._mass], [self._blocks], self._pixels.copy(), []
         slot, support = self._slot.tolist(), self._support.tolist()
-        filled = sum(index >= 0 for index in slot)
+        filled, end = sum(index >= 0 for index in slot), len(pixels)
         for strength in strengths:
             share, block_mass = _level(_flat(strength))
-            pixels.append(share.numpy())
+            # not a list of parts: of the memory that those were in, little could be given back
+            pixels.resize((end + len(share), B), refcheck=False)
+            pixels[end:] = share.numpy()
+            end += len(share)
             share, superblock_mass = _level(block_mass)
             blocks.append(share.numpy())
             total = np.cumsum(superblock_mass.numpy())
@@ -116,7 +120,7 @@ class PixelTable:
         if not shapes:
             return
         self._first = np.append(self._first, self._first[-1] + np.cumsum([len(m) for m in mass[1:]]))
-        self._mass, self._blocks, self._pixels = (np.concatenate(parts) for parts in (mass, blocks, pixels))
+        self._mass, self._blocks, self._pixels = np.concatenate(mass), np.concatenate(blocks), pixels
         self._shape = np.concatenate((self._shape, shapes))
         self._slot, self._support = np.array(slot), np.array(support)
 
@@ -181,7 +185,7 @@ class PixelTable:
 
 def in_threads(strength: Callable[[int], Tensor], images: Sequence[int]) -> Iterator[Tensor]:
     """Strengths of images for `PixelTable.add`, computed in threads, but never more than `AHEAD` in advance."""
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
         for start in range(0, len(images), AHEAD):
             yield from threads.map(strength, images[start : start + AHEAD])
 

@@ -92,7 +92,7 @@ class ImportantPixels:
         """Before training, refuse images that a phase could draw nothing from: InputError as `sample`. And strategies
         whose state cannot be saved: InputError as `state_dict`."""
         batch = self._read(image_batch)
-        for name in self.strategies:
+        for name in (self.config.early, self.config.late):
             self.strategies[name].distribution.drawable(batch)
         self.state_dict()
 
