@@ -30,6 +30,12 @@ def world_size() -> int:
     return _world_size
 
 
+def local_world_size() -> int:
+    """How many of the processes share this machine."""
+    count = os.environ.get("LOCAL_WORLD_SIZE", "")
+    return 1 if _world_size == 1 else int(count) if count.isdecimal() and int(count) else _world_size
+
+
 def is_main() -> bool:
     """Whether this process writes and prints."""
     return _rank == 0

@@ -33,6 +33,8 @@ class Training:
     def run(self) -> None:
         if self.view:
             self.viewer.check()
+        elif self.viewer != ViewerConfig():
+            raise InputError("--viewer.host and --viewer.port have no effect without --view: add it, or leave them out")
         from edge_se_sampler.engine.session import prepare
 
         trainer = prepare(self.config)

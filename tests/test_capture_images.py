@@ -30,13 +30,14 @@ from capture_folder import (
     write_transforms,
 )
 
-from edge_se_sampler.data import memory
+from edge_se_sampler import ranks
+from edge_se_sampler.data import frames, memory
 from edge_se_sampler.data.image_file import ImageHeader, read_header
 from edge_se_sampler.data.lens import find_sources
 from edge_se_sampler.data.scene_file import SourceFile, SourceLocation
 from edge_se_sampler.data.transforms import read_transforms
 from edge_se_sampler.engine.config import MANAGER, override
-from edge_se_sampler.engine.session import _training_memory
+from edge_se_sampler.engine.session import _read_preview, _training_memory
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.methods import method_configs
 from edge_se_sampler.models.config import BYTES_PER_RAY, NeRFModelConfig, decide_size
@@ -148,6 +149,34 @@ def test_images_that_nothing_is_trained_on_take_themselves_alone(
     monkeypatch.setattr(memory, "available_memory", lambda: size - 1)
     with pytest.raises(InputError, match=r"transforms\.json: its 2 images take .*; .* train with a larger --downscale"):
         read(tmp_path, "test")
+
+
+def test_of_the_held_out_views_training_reads_the_first_that_tells_anything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_transforms(tmp_path)
+    names, reads = read(tmp_path, "test").names, []
+    read_image = frames.read_image
+    monkeypatch.setattr(frames, "read_image", lambda file: (reads.append(file), read_image(file))[1])
+    config = override(method_configs()["lean-nerf"], {"data": tmp_path})
+    preview = _read_preview(config)
+    assert preview is not None
+    assert (preview.name, len(reads)) == (names[0], 1)
+    (tmp_path / "masks").mkdir()
+    iio.imwrite(tmp_path / "masks" / Path(names[0]).name, np.zeros((HEIGHT, WIDTH), np.uint8))
+    preview = _read_preview(config)
+    assert preview is not None
+    assert preview.name == names[1]
+    assert "left out" not in capsys.readouterr().err
+
+
+def test_processes_share_what_a_machine_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_available_on_machine", lambda: 2**32)
+    monkeypatch.setattr(memory, "_available_in_container", lambda: None)
+    assert memory.available_memory() == 2**32
+    monkeypatch.setattr(ranks, "_world_size", 8)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")  # on four machines
+    assert memory.available_memory() == 2**31
 
 
 @pytest.mark.parametrize("size", ["paper", "small", "tiny"])

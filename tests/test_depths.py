@@ -81,12 +81,28 @@ def test_a_wrong_pose_far_away_does_not_move_the_scene(has_alpha: bool) -> None:
     np.testing.assert_array_equal(box.center, other_box.center)
     assert (box.half_extent, box.pixel_footprint) == (other_box.half_extent, other_box.pixel_footprint)
     found, expected = (
-        analyze_scene(some, depths.near, depths.far, voxel_size_px=1.0, by_alpha=False, near_share=depths.near_share)
+        analyze_scene(some, depths.near, depths.far, voxel_size_px=1.0, by_alpha=True, near_share=depths.near_share)
         for some in (wrong, others)
     )
     np.testing.assert_array_equal(found.focus, expected.focus)
     assert found.hull.cell_size == expected.hull.cell_size
+    np.testing.assert_array_equal(found.hull.cells, expected.hull.cells)
+    assert found.num_silhouettes == (11 if has_alpha else 0)
+    assert found.is_carved_close == has_alpha
+    assert len(found.hit_pixels) == 12
     assert wrong.subset([0, 1, 2, 3]).leave_out_far().names == wrong.names[:4]  # of four, none is like most
+
+
+def test_what_masks_leave_out_does_not_count_as_missed_by_the_hull() -> None:
+    """A stand that two views show, and their masks hide."""
+    views = ball_views(12, 64)
+    masks = [np.ones((64, 64), bool) for _ in views.images]
+    for i in (0, 1):
+        views.images[i][:6] = 255
+        masks[i][:6] = False
+    hidden = analyze_scene(views.with_masks(masks), 2.5, 5.5, voxel_size_px=0.25, by_alpha=True)
+    shown = analyze_scene(views, 2.5, 5.5, voxel_size_px=0.25, by_alpha=True)
+    assert (hidden.num_silhouettes, shown.num_silhouettes) == (12, 0)
 
 
 def test_points_decide_but_for_stray_ones() -> None:

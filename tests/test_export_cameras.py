@@ -235,10 +235,15 @@ def test_what_had_been_done_to_the_cameras_before_is_said(kind: str, expected: l
         elif kind == "old":
             (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
         (tmp_path / "transforms.json").write_text(json.dumps(document))
-    export_cameras(config_of(tmp_path, "colmap" if kind == "colmap" else "transforms"), tmp_path / "cameras.json")
-    written = json.loads((tmp_path / "cameras.json").read_text())
+    (tmp_path / "points.ply").touch()
+    config, path = config_of(tmp_path, "colmap" if kind == "colmap" else "transforms"), tmp_path / "cameras.json"
+    line = export_cameras(config, path)
+    written = json.loads(path.read_text())
     assert written["applied_transform"] == expected
     assert written["applied_scale"] == (2.5 if kind == "written" else 1)
+    # nerfstudio would scale the points, and not the cameras
+    assert written.get("ply_file_path") == (None if kind == "written" else "points.ply")
+    assert ("is not named" in line) == (kind == "written")
 
 
 def test_masks_that_nerfstudio_would_read_otherwise_are_written_anew(tmp_path: Path) -> None:
@@ -263,6 +268,37 @@ def test_masks_that_nerfstudio_would_read_otherwise_are_written_anew(tmp_path: P
         mask = iio.imread(tmp_path / frames[f"images/{NAMES[i]}"]["mask_path"])
         np.testing.assert_array_equal(mask, shown)  # gray
     assert frames[f"images/{NAMES[0]}"]["mask_path"] == f"masks/{NAMES[0]}"
+
+
+def test_masks_are_written_once_all_can_be_and_keep_the_names_of_their_images(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    mask = np.full((HEIGHT, document["w"], 3), 255, np.uint8)
+    mask[0, :3] = 0
+    for i in range(4):
+        iio.imwrite(tmp_path / f"mask{i}.png", mask)
+        document["frames"][i]["mask_path"] = f"mask{i}.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    config, path = config_of(tmp_path, "transforms"), tmp_path / "out" / "cameras.json"
+    path.parent.mkdir()
+    export_cameras(config, path)
+    before = {file: file.read_bytes() for file in path.parent.rglob("*.*") if file.is_file()}
+    masks = {frame["file_path"]: frame["mask_path"] for frame in json.loads(path.read_text())["frames"]}
+    assert len(before) == 1 + 4 + 1  # and one in which all is known
+    for image, name in masks.items():
+        assert Path(name).name in (f"{Path(image).name}.png", f"all-known-{document['w']}x{HEIGHT}.png")
+    content = (tmp_path / "mask3.png").read_bytes()
+    (tmp_path / "mask3.png").write_bytes(content[:-30])
+    mask[:] = 0
+    iio.imwrite(tmp_path / "mask0.png", mask)
+    with pytest.raises(InputError, match="mask3"):
+        export_cameras(config, path)
+    assert before == {file: file.read_bytes() for file in path.parent.rglob("*.*") if file.is_file()}
+    (tmp_path / "mask3.png").write_bytes(content)
+    document["applied_transform"] = [*NOTHING, [0, 0, 0, 1]]
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="applied_transform"):
+        export_cameras(config, path)
+    assert before == {file: file.read_bytes() for file in path.parent.rglob("*.*") if file.is_file()}
 
 
 def test_what_nerfstudio_does_not_heed_is_said(tmp_path: Path) -> None:

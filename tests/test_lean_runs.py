@@ -201,6 +201,26 @@ def test_a_run_is_not_resumed_on_a_scene_that_has_changed(larger: Path, tmp_path
     assert (again.pipeline.model.grid.bricks == grid.bricks).all()
 
 
+def test_the_viewer_knows_the_phase_of_a_run_by_the_clock(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before it has ended, its checkpoint alone tells how far it is."""
+    phases = {f"{SAMPLER}.early": "edge", f"{SAMPLER}.late": "se"}
+    changes = {"data": scene, "output_dir": tmp_path, "machine.device_type": "cpu", "time_budget": "3s", **phases}
+    trainer = prepare(override(config_of(None), changes))
+    train_iteration = trainer.train_iteration
+
+    def interrupted(step: int) -> float:
+        trainer.stop_requested = trainer.progress(step) > 0.4
+        return train_iteration(step)
+
+    monkeypatch.setattr(trainer, "train_iteration", interrupted)
+    monkeypatch.setattr("time.monotonic", itertools.count(0, 0.01).__next__)
+    trainer.train()
+    viewed = Viewed.load(trainer.run, RunFolder(trainer.run.path).config(method_configs()))
+    assert (viewed.trainer.next_step, viewed.strategy) == (trainer.next_step, "se")
+
+
 def test_a_budget_and_what_one_came_out_as_are_not_both_given(larger: Path, tmp_path: Path) -> None:
     config = override(lean_config(larger, tmp_path), {"time_budget": "10m", "segments": (1,) * 100})
     with pytest.raises(InputError, match="--time-budget and --segments: give one of them"):

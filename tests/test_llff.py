@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -30,6 +31,17 @@ def test_rays_and_depths(scale: float, tmp_path: Path) -> None:
     found = find_depths(views)
     assert found.near == pytest.approx(0.9 * 2, rel=1e-3)
     assert found.far == pytest.approx(1.1 * 8, rel=1e-3)
+
+
+def test_masks_of_instant_ngps_are_no_images(tmp_path: Path) -> None:
+    write_llff(tmp_path, bounds())
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, :9] = 255
+    iio.imwrite(tmp_path / "images" / f"dynamic_mask_{Path(NAMES[1]).stem}.png", mask)
+    views = read(tmp_path)
+    assert views.names == tuple(NAMES[1:8])
+    assert views.masks is not None
+    np.testing.assert_array_equal(views.masks[0], mask == 0)
 
 
 def test_a_model_of_colmap_beside_it_says_more(tmp_path: Path) -> None:

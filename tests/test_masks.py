@@ -185,10 +185,11 @@ def test_the_command_writes_what_readers_find(
     monkeypatch.setattr("edge_se_sampler.masks.command.MAX_SIDE", 160)  # of 480, in less time
     folder, count = tmp_path / "ring", 9
     write_capture(folder, images[:count])
-    command = ["masks", "--data", folder, "--output-path", tmp_path / "masks.png"]
+    command = ["masks", "--data", folder, "--data-format", "transforms", "--output-path", tmp_path / "masks.png"]
     answer = edge_se(*command)
     assert answer.code == 0
     assert f"{count} masks in {folder / 'masks'}" in answer.out
+    assert answer.out.rstrip().endswith("--masks object --data-format transforms")  # the same cameras
     assert sorted(path.name for path in (folder / "masks").iterdir()) == [f"{i:02d}.png.png" for i in range(count)]
     views = read_split(folder, "train", DataSettings(masks="object", downscale=4))
     assert views is not None

@@ -175,6 +175,17 @@ class TestPixels:
         for folder, corner in copies_of(tmp_path / "scene"):
             np.testing.assert_array_equal(iio.imread(folder / "m.png"), on_canvas(mask, 10, 6, *corner))
 
+    def test_instant_ngps_masks_mean_the_same_in_the_copies(self, tmp_path: Path) -> None:
+        doc = write_scene(tmp_path / "scene")
+        mask = pixels(9, channels=3)[..., 0] & 1
+        iio.imwrite(tmp_path / "scene/train/dynamic_mask_0.png", mask * np.uint8(255))
+        doc["frames"][0]["mask_path"] = "train/dynamic_mask_0.png"
+        write_json(tmp_path / "scene", doc)
+        for folder, corner in copies_of(tmp_path / "scene"):
+            masks = read_blender(folder, "train").masks
+            assert masks is not None
+            np.testing.assert_array_equal(masks[0], on_canvas(1 - mask, 10, 6, *corner) > 0)
+
     def test_masks_that_no_json_lists_hide_it_too(self, tmp_path: Path) -> None:
         write_scene(tmp_path / "scene")
         mask = pixels(9, channels=3)[..., 0] & 1

@@ -226,6 +226,23 @@ def test_probabilities_are_those_of_the_current_strategy() -> None:
     assert isinstance(sampler.strategies["se"].selector, RankedError)
 
 
+def test_pixels_that_are_never_drawn_have_no_ranks() -> None:
+    """Whose errors are small, as those of the background are."""
+    views = VIEWS.with_masks([np.arange(256).reshape(16, 16) % 3 == 0] * len(VIEWS.images))
+    by_errors = {f"{SAMPLER}.early": "uniform", f"{SAMPLER}.late": "se"}
+    viewed = Viewed(tiny_trainer(override(config_of(100), by_errors), views))
+    uniform = viewed.probability(0, lambda: None)
+    assert uniform is not None
+    drawn = uniform > 0
+    assert drawn.mean() < 0.4
+    viewed.trainer.pipeline.datamanager.train_pixel_sampler.set_step(50)
+    errors = np.where(drawn, 1.0 + np.arange(drawn.size).reshape(drawn.shape), 0.0)
+    found = viewed.probability(0, lambda: errors)
+    assert found is not None
+    relative = found[drawn] / found[drawn].mean()
+    assert (relative.min(), relative.max()) == pytest.approx((0, 2), abs=0.05)
+
+
 def test_an_error_is_the_difference_to_the_image(viewed: Viewed) -> None:
     renderer = Renderer(viewed)
     error = renderer.squared_error(1, lambda: False)

@@ -51,6 +51,21 @@ def test_a_newer_checkpoint_is_shown_and_nothing_is_written(run: Path) -> None:
     assert torch.equal(viewed.model.state_dict()[name], state["model"][name])
 
 
+def test_what_was_learnt_of_other_images_is_not_shown(run: Path) -> None:
+    config = RunFolder(run).config(method_configs())
+    (old,) = (run / "checkpoints").iterdir()
+    state = load_checkpoint(old, config_digest(config))
+    state |= {"data_digest": "another", "sampler": {"late.selector": "of images that are no more"}}
+    save_checkpoint(run / "checkpoints", 8, state)
+    assert Viewed.load(RunFolder(run), config).trainer.next_step == 6
+
+
+def test_an_address_has_no_meaning_without_the_viewer(edge_se) -> None:
+    answer = edge_se("train", "lean-nerf", "--viewer.port", 8000, "--data", "nowhere")
+    assert answer.code == 2
+    assert "no effect without --view" in answer.err
+
+
 def test_a_port_that_is_taken_is_named(run: Path, edge_se) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny import tiny_model
 
 from edge_se_sampler.data.cameras import Cameras, RayBundle
 from edge_se_sampler.engine.frames import find_depth_range, render_frame
@@ -189,6 +190,14 @@ def test_a_camera_path_sees_what_training_views_had_no_depth_for(factor: float) 
     assert distance - 700 < seen.min() < distance - 300
     assert depths[0] <= seen.min() / 1e3 < seen.max() / 1e3 < depths[1]
     assert render_frame(model, camera, 0, names, 1e-3)["accumulation"].max() == 0  # as a held-out view would be
+
+
+def test_the_dense_networks_are_sampled_between_their_depths_alone() -> None:
+    grid = ball_model(1).grid
+    model, camera = tiny_model(grid=grid, near=2.0, far=4.0), looking((1.5, -9.0, 3.0), 480.0)
+    assert find_depth_range(model, camera) == (2.0, 4.0)
+    rays = CameraRays.of(model, camera, everything=True)[0:4]
+    assert "nears" not in rays.metadata
 
 
 def test_depths_stay_where_they_show_all_cells() -> None:

@@ -24,9 +24,9 @@ class RayBundle:
     camera_indices: Tensor  # (n, 1) int64
     metadata: dict[str, Tensor]
     """"directions_norm" (n, 1): length of the direction whose depth along the axis is 1; "pixel_axes" (n, 2, 3): what
-    that changes by from a pixel to the one below, and to the one on the right. A host's may have "nears" and "fars"
-    (n, 1): distances from the origin, world units, between which the ray is sampled instead of the model's depths. Of
-    a model that knows them, "empty_depths" (n, 1): `RayModel.find_empty_depths`."""
+    that changes by from a pixel to the one below, and to the one on the right. There may be "nears" and "fars" (n,
+    1): distances from the origin, world units, between which models that `meets_all_cells` sample the ray instead of
+    between their depths. Of a model that knows them, "empty_depths" (n, 1): `RayModel.find_empty_depths`."""
 
     def __len__(self) -> int:
         return len(self.origins)

@@ -13,7 +13,7 @@ from edge_se_sampler.data.capture import EVAL_EVERY, SPLITS, Capture, Split
 from edge_se_sampler.data.colmap import read_colmap
 from edge_se_sampler.data.colmap_model import find_models
 from edge_se_sampler.data.config import DataFormat, Masks
-from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, check_scene, load_views
+from edge_se_sampler.data.frames import Frame, LoadSettings, Progress, Select, check_scene, load_views, select_all
 from edge_se_sampler.data.llff import bounds_path, read_llff
 from edge_se_sampler.data.mask_files import describe_unused_masks
 from edge_se_sampler.data.memory import ModelMemory
@@ -43,7 +43,7 @@ class DataSettings:
     downscale: int = 1
     model_memory: ModelMemory | None = None
     """What training takes of memory beside the images; None: nothing is trained on them."""
-    select: Select = lambda _: None
+    select: Select = select_all
     """Which of a split's views are read."""
 
 
@@ -99,7 +99,7 @@ def read_split(
         _check_unsplit(settings, has_own_split=True)
         if split != "train" and is_left_out(folder, split):
             return None
-        return _leave_out_unknown(read_blender(folder, split, load, progress), folder, split)
+        return _leave_out_unknown(read_blender(folder, split, load, progress), folder, split, settings)
     capture, rows, eval_every = _read_capture(folder, split, settings, data_format)
     if split == "train" and not rows:
         problem, hint = "has no images to train on", "add some, or correct its lists"
@@ -114,14 +114,16 @@ def read_split(
     views = load_views([capture.frames[i] for i in rows], load, progress)
     points = None if capture.points is None else tuple(capture.points[i] for i in rows)
     views = replace(views, points=points, depths=None, data_format=data_format, eval_every=eval_every)
-    return _leave_out_unknown(views, folder, split)
+    return _leave_out_unknown(views, folder, split, settings)
 
 
-def _leave_out_unknown(views: Views, folder: Path, split: Split) -> Views | None:
-    """The views, or None and a line if masks leave nothing of all of them."""
+def _leave_out_unknown(views: Views, folder: Path, split: Split, settings: DataSettings) -> Views | None:
+    """The views, or None if masks leave nothing of all of them, and a line if these are all of the split."""
     if views.masks is None or any(mask.any() for mask in views.masks):
         return views
-    print(f"{folder}: the {split} views are masked as a whole, {len(views.names)} of them: left out", file=sys.stderr)
+    if settings.select is select_all:
+        problem = f"the {split} views are masked as a whole, {len(views.names)} of them: left out"
+        print(f"{folder}: {problem}", file=sys.stderr)
     return None
 
 

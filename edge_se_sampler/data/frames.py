@@ -32,6 +32,12 @@ Select = Callable[[int], Sequence[int] | None]
 T = TypeVar("T")
 DYNAMIC_MASK = "dynamic_mask_"
 """How the names of instant-ngp's masks begin."""
+
+
+def select_all(_: int) -> None:
+    """A `Select` of all views."""
+
+
 MAX_MISFIT = 2**22
 """Pixels of a mask of another size than its image, up to which it is decoded: it may be damaged, too."""
 MAX_REMAPPED = 2**15 - 2
@@ -76,7 +82,7 @@ class LoadSettings:
     """Every so many pixels along both axes become one."""
     model_memory: ModelMemory | None = None
     """What training takes of memory beside them; None: nothing is trained on them."""
-    select: Select = lambda _: None
+    select: Select = select_all
     """Which of a split's views are read."""
     held_out: bool = False
     """Whether renderings are to be compared with them: masks may then leave nothing of all."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from edge_se_sampler.data.capture import Capture
 from edge_se_sampler.data.colmap import find_images, is_scaled, list_visible
-from edge_se_sampler.data.frames import MAX_POSITION, Frame, choose_orientation, read_headers
+from edge_se_sampler.data.frames import DYNAMIC_MASK, MAX_POSITION, Frame, choose_orientation, read_headers
 from edge_se_sampler.data.image_file import ImageHeader
 from edge_se_sampler.data.lens import Intrinsics
 from edge_se_sampler.data.mask_files import find_mask
@@ -33,7 +33,8 @@ def read_llff(folder: Path) -> Capture:
     InputError for files that cannot be used, or if there is not one image for each pose."""
     rows, location = _read_rows(bounds_path(folder)), SourceLocation(bounds_path(folder))
     images = find_images(folder)
-    names = sorted(name for name in list_visible(images) if Path(name).suffix.lower() in SUFFIXES)
+    found = [name for name in list_visible(images) if not name.startswith(DYNAMIC_MASK)]
+    names = sorted(name for name in found if Path(name).suffix.lower() in SUFFIXES)
     if len(names) != len(rows):
         problem = f"has {len(rows)} poses, {images.name} has {len(names)} images"
         raise location.error(problem, "put the images there that the poses were found with, and no others")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edge_se_sampler import ranks
 from edge_se_sampler.data.scene_file import SourceLocation
 
 COPIES = 2
@@ -25,8 +26,8 @@ MEMORY_AT_WORK = 3 * 2**29
 MIN_SIDE = 50
 """Pixels of the shorter side of the images that are still worth training on."""
 ModelMemory = Callable[[bool, int], int]
-"""Whether alpha tells where the object is, and the longest side of the images, in pixels -> bytes that training a model
-takes beside them."""
+"""Whether all images have alpha, which may tell where the object is, and their longest side, in pixels -> bytes that
+training a model takes beside them."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,10 @@ def num_workers(num_pixels: int) -> int:
 
 def available_memory() -> int | None:
     """Bytes that programs may still take, of the machine's and of their container's; where neither says, all that the
-    machine has; None: that is not known."""
+    machine has; None: that is not known. Of several processes that train together, each has its share."""
     found = [size for size in (_available_on_machine(), _available_in_container()) if size is not None]
-    return min(found, default=_physical_memory())
+    available = min(found, default=_physical_memory())
+    return None if available is None else available // ranks.local_world_size()
 
 
 def _available_on_machine() -> int | None:

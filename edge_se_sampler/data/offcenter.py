@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import imageio.v3 as iio
@@ -26,7 +26,7 @@ import numpy as np
 
 from edge_se_sampler.data.blender import is_left_out, read_blender, transforms_path
 from edge_se_sampler.data.capture import SPLITS, Split
-from edge_se_sampler.data.frames import read_mask
+from edge_se_sampler.data.frames import DYNAMIC_MASK, read_mask
 from edge_se_sampler.data.new_folder import staged_folders
 from edge_se_sampler.data.scene_file import JsonValue, quote, read_json
 from edge_se_sampler.data.transforms_frames import Entry, listed_file, read_entries, read_lens, read_path
@@ -186,6 +186,8 @@ def _output_files(data: Path, frame: JsonValue, entry: Entry, written: dict[str,
             listed = listed_file(read_path(value, data))
             stem, suffix = os.path.splitext(Path(os.path.normpath(listed)).as_posix())
             file = stem + (suffix if suffix.lower() == ".png" else ".png")
+            if _is_inverted(key, file):  # and the copy's mask is not
+                file = str(PurePosixPath(file).with_name(PurePosixPath(file).name.removeprefix(DYNAMIC_MASK)))
             if file.startswith("../"):  # and in again: the loader does not mind, but we write there
                 raise value.location.error(f"{quote(listed)} leads out of the folder", "write the path without ..")
             source = (key, os.path.realpath(data / listed))
@@ -229,14 +231,20 @@ def _document(
     top["frames"] = [
         {key: value for key, value in frame.items() if key not in ANGLES}
         | {key: value for key, value in own.items() if key in frame or key not in shared}
-        | {key: file for key, file in written.items() if not _is_listed_png(frame.get(key))}
+        | {key: file for key, file in written.items() if not _is_kept(key, frame.get(key))}
         for frame, own, written in zip(source["frames"], intrinsics, files, strict=True)
     ]
     return top
 
 
-def _is_listed_png(path: str | None) -> bool:
-    return path is not None and listed_file(path).lower().endswith(".png")
+def _is_kept(key: str, path: str | None) -> bool:
+    """Whether a frame's file has the path in a copy that it is listed by, if it is."""
+    return path is not None and listed_file(path).lower().endswith(".png") and not _is_inverted(key, path)
+
+
+def _is_inverted(key: str, path: str) -> bool:
+    """Whether a listed file is a mask of instant-ngp's, which is read the other way round by its name."""
+    return key == "mask_path" and PurePosixPath(path).name.startswith(DYNAMIC_MASK)
 
 
 def _write_view(folder: Path, files: dict[str, str], canvas: Canvas, image: np.ndarray, entry: Entry) -> None:

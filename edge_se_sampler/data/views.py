@@ -40,10 +40,16 @@ class Views:
         cameras = self.cameras[list(indices)]
         return replace(self, names=names, images=images, masks=masks, cameras=cameras, points=points)
 
-    def leave_out_far(self) -> Views:
-        """Without the views of cameras that are far from all others: they do not tell where the scene is."""
+    def find_near(self) -> list[int]:
+        """Indices of the views but those of cameras that are far from all others: they do not tell where the scene
+        is."""
         far, _ = find_far(self.cameras.camera_to_worlds[:, :, 3].numpy())
-        return self.subset(np.flatnonzero(~far).tolist()) if far.any() else self
+        return np.flatnonzero(~far).tolist()
+
+    def leave_out_far(self) -> Views:
+        """The views of `find_near`."""
+        near = self.find_near()
+        return self if len(near) == len(self.names) else self.subset(near)
 
     def with_masks(self, masks: Sequence[np.ndarray]) -> Views:
         """The same views, to be trained on only where both `masks` and the views' own, if any, are True."""

@@ -36,7 +36,7 @@ def render_frame(
     depths: tuple[float, float] | None = None,
 ) -> dict[str, np.ndarray]:
     """Images of one camera, by output; of what is between near and far, or, with `depths`, which are nearest and
-    farthest then, of all that the model has.
+    farthest then, of all cells, see `meet_all_cells`.
 
     rgb           (H, W, 3) uint8
     rgba          (H, W, 4) uint8: straight alpha, the accumulation
@@ -78,9 +78,9 @@ def _render_pixels(
 
 
 def find_depth_range(model: RayModel, cameras: Cameras) -> tuple[float, float]:
-    """The model's near and far, moved to where cameras see all of its cells."""
+    """The model's near and far, moved to where cameras see all of its cells, if rays meet them all."""
     near, far = model.config.depths
-    if model.grid is None:
+    if not model.meets_all_cells or model.grid is None:
         return near, far
     poses = cameras.camera_to_worlds.cpu().double()
     box = (model.grid.size * model.grid.cell_size).cpu()

@@ -41,6 +41,10 @@ class Pipeline:
     hull: Hull | None = None
     """The cells with which training begins; None: the model has no grid."""
 
+    def has_data_of(self, state: Mapping[str, Any]) -> bool:
+        """Whether a checkpoint is of a training on the same views, as far as it says."""
+        return state.get("data_digest", self.data_digest) == self.data_digest
+
     @classmethod
     def build(
         cls,

@@ -71,9 +71,9 @@ class CameraRays:
 
 
 def meet_all_cells(model: RayModel, rays: RayBundle) -> None:
-    """Let rays meet all cells that a model has, also nearer or farther off than the depths of its training views;
-    without a grid they stay as they are."""
-    if model.grid is not None:
+    """Let rays meet all cells that a model has, also nearer or farther off than the depths of its training views. The
+    dense networks, which are sampled between these, render them as ever."""
+    if model.meets_all_cells and model.grid is not None:
         empty = model.grid.empty_depth(rays.origins)[:, None] * rays.metadata["directions_norm"]
         rays.metadata.update(nears=empty, fars=torch.full_like(empty, math.inf))
 

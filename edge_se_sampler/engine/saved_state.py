@@ -15,7 +15,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-from edge_se_sampler.engine.plan import NUM_SEGMENTS
+from edge_se_sampler.engine.plan import NUM_SEGMENTS, Plan
 from edge_se_sampler.errors import InputError
 from edge_se_sampler.models.config import ModelConfig, NeRFModelConfig
 from edge_se_sampler.sampling.pixel_sampler import ImportantPixels
@@ -108,6 +108,12 @@ def check_training(state: Mapping[str, Any], trainer: Any) -> None:
     _require(_is_training, state, trainer)
 
 
+def load_plan(plan: Plan, state: Mapping[str, Any]) -> None:
+    """Let a plan continue from a checkpoint's; InputError if it cannot."""
+    _require(_is_plan, state, plan)
+    plan.load_state_dict(dict(state))
+
+
 def load_sampler(manager: Any, state: Mapping[str, Any]) -> None:
     """Let a data manager's sampler continue from a checkpoint's state; InputError if it cannot."""
     sampler = manager.train_pixel_sampler
@@ -130,16 +136,23 @@ def _is_training(state: Mapping[str, Any], trainer: Any) -> bool:
     optimizer, scheduler, reset = (state[key] for key in ("optimizer", "scheduler", "dead_network_reset"))
     own = trainer.scheduler.state_dict()
     own_reset = None if trainer.dead_network_reset is None else trainer.dead_network_reset.state_dict()
-    segments, stopping = state["plan"]["segments"], state.get("early_stopping")
+    stopping = state.get("early_stopping")
     return (
-        is_alike(state["plan"], trainer.plan.state_dict() | {"segments": [0] * len(segments)})
-        and len(segments) <= NUM_SEGMENTS
-        and all(0 <= length < MAX_STEP for length in segments)
+        _is_plan(state["plan"], trainer.plan)
         and is_alike({key: scheduler.get(key, own[key]) for key in own}, own)
         and scheduler["last_epoch"] == state["step"] + 1
         and is_alike(reset, own_reset)
         and (stopping is None or _is_early_stopping(stopping, trainer.early_stopping.state_dict()))
         and (optimizer is None or _is_optimizer(optimizer, trainer.optimizer))
+    )
+
+
+def _is_plan(state: Mapping[str, Any], plan: Plan) -> bool:
+    segments = state["segments"]
+    return (
+        is_alike(state, plan.state_dict() | {"segments": [0] * len(segments)})
+        and len(segments) <= NUM_SEGMENTS
+        and all(0 <= length < MAX_STEP for length in segments)
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import shutil
 import sys
 import time
@@ -19,7 +20,7 @@ import torch
 from edge_se_sampler import ranks
 from edge_se_sampler.data.capture import Split
 from edge_se_sampler.data.dataset import DataSettings, read_split
-from edge_se_sampler.data.frames import Select
+from edge_se_sampler.data.frames import Select, select_all
 from edge_se_sampler.data.memory import ModelMemory
 from edge_se_sampler.data.views import Views
 from edge_se_sampler.engine.checkpoint import load_latest
@@ -207,9 +208,17 @@ def _read_first_split(config: TrainerConfig, splits: Sequence[Split]) -> Views |
 
 
 def _read_preview(config: TrainerConfig) -> Picture | None:
-    """The first held-out view of which some pixels are known; None: no view is held out."""
-    views = _read_first_split(config, ("val", "test"))
-    return None if views is None else to_pictures(views)[0]
+    """The first held-out view of which some pixels are known, and no others are read but to find it; None: no view is
+    held out."""
+    for split, select in itertools.product(("val", "test"), (_select_first, select_all)):
+        views = _read_split(config, split, select=select)
+        if views is not None:
+            return to_pictures(views)[0]
+    return None
+
+
+def _select_first(_: int) -> list[int]:
+    return [0]
 
 
 def _compare_alpha(config: TrainerConfig, views: Views, preview: Picture) -> None:
@@ -250,7 +259,7 @@ def _training_memory(config: TrainerConfig, has_alpha: bool, longest: int) -> in
 
 
 def _read_split(
-    config: TrainerConfig, split: Split, model_memory: ModelMemory | None = None, select: Select = lambda _: None
+    config: TrainerConfig, split: Split, model_memory: ModelMemory | None = None, select: Select = select_all
 ) -> Views | None:
     assert config.data is not None
     settings = DataSettings(config.data_format, config.masks, config.eval_every, config.downscale, model_memory, select)

@@ -84,7 +84,7 @@ class Trainer:
     def resume(self, state: dict[str, Any], changed_data: bool = False) -> None:
         """Continue from a checkpoint's state; InputError if it is another model's, or, unless that is accepted, of
         other training images. What the sampler remembers of others is forgotten."""
-        is_same_data = state.get("data_digest", self.pipeline.data_digest) == self.pipeline.data_digest
+        is_same_data = self.pipeline.has_data_of(state)
         if not (is_same_data or changed_data):
             remedy = "restore them, or add --changed-data True"
             raise InputError(f"{self.config.data}: not the training images that the run began with; {remedy}")

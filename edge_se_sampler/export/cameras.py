@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from edge_se_sampler.data.frames import DYNAMIC_MASK, Frame, read_mask
 from edge_se_sampler.data.scene_file import SourceFile, read_json
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, make_folder, write_image, write_json
+from edge_se_sampler.engine.files import check_output, make_folder, write_atomically, write_json
 from edge_se_sampler.engine.session import check_run_data, select_views
 from edge_se_sampler.errors import InputError
 
@@ -51,24 +52,29 @@ def export_cameras(config: TrainerConfig, path: Path) -> str:
     splits["val"], splits["test"] = splits["val"] or splits["test"], splits["test"] or splits["val"]
     listed = {frame.image.path: frame for split in SPLITS for frame in splits[split]}
     frames = {image: describe_frame(frame, path.parent) for image, frame in listed.items()}
-    masks = _mask_all(list(frames.values()), path.parent)
-    num_written = _write_masks(listed, frames, path)
     motion, scale = read_applied(config.data, config.data_format)
+    rewritten = _rewrite_masks(listed, frames, path)
+    masks = _mask_all(list(frames.values()))
+    for name, mask in (rewritten | masks).items():  # only once all could be read
+        make_folder((path.parent / name).parent, "the masks'")
+        write_atomically(path.parent / name, mask)
     applied = {"applied_transform": motion[:3].tolist(), "applied_scale": scale}
     content = EXPORTER | applied | share_intrinsics(list(frames.values()))
     for split in SPLITS if splits["test"] else ():  # nerfstudio wants all lists or none
         content[f"{split}_filenames"] = [frames[frame.image.path]["file_path"] for frame in splits[split]]
     line = f"{path}: {len(frames)} cameras, {len(splits['train'])} of them to train on"
-    line += f"; masks beside it, in which all is known, for those without: {', '.join(masks)}" if masks else ""
-    if num_written:
-        line += f"; {num_written} masks written anew beside it, which nerfstudio would read otherwise"
+    line += f"; masks beside it, in which all is known, for those without: {', '.join(sorted(masks))}" if masks else ""
+    if rewritten:
+        line += f"; {len(rewritten)} masks written anew beside it, which nerfstudio would read otherwise"
     if len({frame["camera_model"] for frame in frames.values()}) > 1:
         line += "; nerfstudio takes all cameras for perspective ones, since fisheyes are among others"
     if turned := sum(frame.header.orientation >= 5 for frame in listed.values()):
         line += f"; nerfstudio does not turn images as their EXIF orientation says, as {turned} of these have to be"
-    if (path.parent / POINTS_NAME).is_file():
+    if (path.parent / POINTS_NAME).is_file() and scale == 1:
         content["ply_file_path"] = POINTS_NAME
         line += f"; the {POINTS_NAME} that lies beside it is named as their points"
+    elif (path.parent / POINTS_NAME).is_file():
+        line += f"; the {POINTS_NAME} that lies beside it is not named: nerfstudio would scale it by applied_scale, too"
     write_json(path, content)
     return line
 
@@ -96,32 +102,35 @@ def describe_frame(frame: Frame, folder: Path) -> dict[str, Any]:
     return entry
 
 
-def _mask_all(frames: list[dict[str, Any]], folder: Path) -> list[str]:
-    """If some frames have masks, give the others one that says that all is known, written into the folder: nerfstudio
-    wants masks of all frames or of none. Returns the names of these."""
-    without = [frame for frame in frames if "mask_path" not in frame]
-    without = without if len(without) < len(frames) else []
-    for frame in without:
-        frame["mask_path"] = f"all-known-{frame['w']}x{frame['h']}.png"
-        if not (folder / frame["mask_path"]).exists():
-            write_image(folder / frame["mask_path"], np.full((frame["h"], frame["w"]), 255, np.uint8))
-    return sorted({frame["mask_path"] for frame in without})
-
-
-def _write_masks(listed: dict[Path, Frame], entries: dict[Path, dict[str, Any]], path: Path) -> int:
-    """Write what is known as a gray PNG, into a folder beside the json, for frames whose mask is none, or says it
-    otherwise; returns how many."""
-    folder, count = path.parent / f"{path.stem}-masks", 0
-    for number, (image, frame) in enumerate(listed.items()):
+def _rewrite_masks(listed: dict[Path, Frame], entries: dict[Path, dict[str, Any]], path: Path) -> dict[str, bytes]:
+    """What is known as a gray PNG, for frames whose mask is none, or says it otherwise: the files, in a folder beside
+    the json and named as the images are, which the frames' entries name from now on."""
+    root, files = os.path.commonpath([image.parent for image in listed]), {}
+    for image, frame in listed.items():
         if frame.mask is None or _is_plain(frame.mask):
             continue
-        make_folder(folder, "the masks'")
-        mask = folder / f"{number:05}.png"
-        size = frame.header.height, frame.header.width
-        known = read_mask(frame.mask, np.broadcast_to(np.uint8(0), size)) > 0
-        write_image(mask, np.where(known, np.uint8(255), np.uint8(0)))
-        entries[image]["mask_path"], count = relative_path(mask, path.parent), count + 1
-    return count
+        known = read_mask(frame.mask, np.broadcast_to(np.uint8(0), (frame.header.height, frame.header.width))) > 0
+        name = f"{path.stem}-masks/{relative_path(image, Path(root))}.png"
+        files[name] = _encode(np.where(known, np.uint8(255), np.uint8(0)))
+        entries[image]["mask_path"] = name
+    return files
+
+
+def _mask_all(frames: list[dict[str, Any]]) -> dict[str, bytes]:
+    """If some frames have masks, give the others one that says that all is known: nerfstudio wants masks of all frames
+    or of none. Returns the files of these, beside the json."""
+    without, files = [frame for frame in frames if "mask_path" not in frame], {}
+    for frame in without if len(without) < len(frames) else []:
+        name = frame["mask_path"] = f"all-known-{frame['w']}x{frame['h']}.png"
+        files[name] = files.get(name) or _encode(np.full((frame["h"], frame["w"]), 255, np.uint8))
+    return files
+
+
+def _encode(mask: np.ndarray) -> bytes:
+    """A PNG."""
+    file = io.BytesIO()
+    Image.fromarray(mask).save(file, "PNG")
+    return file.getvalue()
 
 
 def _is_plain(mask: SourceFile) -> bool:

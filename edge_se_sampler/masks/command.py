@@ -69,6 +69,7 @@ def make_masks(folder: Path, settings: DataSettings, picture: Path, out: Path | 
              f"median image ({shares.min():.0%} to {shares.max():.0%})"]  # fmt: skip
     lines += [f"of {len(odd)} images all or nothing is object, {quote(odd[0])} for one"] if odd else []
     then = f"edge-se train lean-nerf --data {shlex.quote(str(folder))} --masks object"
+    then += "" if settings.data_format == "auto" else f" --data-format {settings.data_format}"
     if out != folder:
         then = f"copy what is in {out} into {folder}, or into a copy of it; then: {then}"
     return "\n".join([*lines, f"look at {picture}; then: {then}"])

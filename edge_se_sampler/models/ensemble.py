@@ -17,6 +17,7 @@ class Ensemble(RayModel):
 
     def __init__(self, members: Sequence[RayModel]) -> None:
         super().__init__(members[0].config, members[0].grid)
+        self.meets_all_cells = members[0].meets_all_cells
         self.members = nn.ModuleList(members)
 
     @property

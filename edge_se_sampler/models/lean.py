@@ -102,6 +102,7 @@ class LeanModel(RayModel):
 
     config: LeanModelConfig
     grid: BrickGrid
+    meets_all_cells = True
     supersampled: Tensor
     """() bool: whether a pixel's color is the mean over 2 x 2 rays through it, rather than that of one."""
     subdivides_early: Tensor

@@ -35,6 +35,9 @@ class RayModel(nn.Module, ABC):
 
     networks: tuple[str, ...] = ("fine",)
     """Names of the networks, each an attribute; the colors of "fine" are the model's."""
+    meets_all_cells: bool = False
+    """Whether rays meet all cells of its grid between their "nears" and "fars", if they have them; else samples lie
+    between the model's depths."""
 
     def __init__(self, config: ModelConfig, grid: BrickGrid | None) -> None:
         super().__init__()

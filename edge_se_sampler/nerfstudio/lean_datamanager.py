@@ -32,6 +32,11 @@ class LeanDataManager(EdgeSEDataManager):
         }
         return dataset
 
+    def setup_train(self) -> None:
+        """As nerfstudio's, with the images' alpha, which it composites where they are only looked at."""
+        self.train_dataset.keep_alpha()
+        super().setup_train()
+
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
         """As EdgeSEDataManager, once the model's cells tell which pixels see any."""
         model = training_callback_attributes.pipeline.model

@@ -81,12 +81,15 @@ class LeanNerfModel(Model):
         """rgb (n, 3) and accumulation (n, 1); in evaluation depth (n, 1) along the ray, of what stops more than half of
         the light, or far; in training what they were made of."""
         rays = convert_rays(ray_bundle)
-        outputs, rendered = self.field.render(rays)
-        rgb, opacity = outputs["rgb_fine"], outputs["accumulation_fine"]
         if self.training:
-            return {"rgb": rgb, "accumulation": opacity, "rendered": rendered}
+            outputs, rendered = self.field.render(rays)
+            return {"rgb": outputs["rgb_fine"], "accumulation": outputs["accumulation_fine"], "rendered": rendered}
+        # as many rays at once as its memory allows, which hosts do not know
+        parts = [self.field.render(rays[some])[0] for some in self.field.chunks(len(rays))]
+        names = "rgb_fine", "accumulation_fine", "depth_fine"
+        rgb, opacity, depth = (torch.cat([part[name] for part in parts]) for name in names)
         far = self.field.config.depths[1] * rays.metadata["directions_norm"]
-        depth = remove_background(outputs["depth_fine"], opacity, far)
+        depth = remove_background(depth, opacity, far)
         return {"rgb": rgb, "accumulation": opacity, "depth": torch.where(opacity > 0.5, depth, far)}
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:

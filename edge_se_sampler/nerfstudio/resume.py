@@ -71,7 +71,8 @@ def restore_schedule(trainer: Any, schedule: AdaptiveSchedule) -> None:
 def schedule_writer(trainer: Any, schedule: AdaptiveSchedule) -> Callable[..., None]:
     """A function to be called after each step: writes the schedule's state whenever nerfstudio saves a checkpoint, and
     raises InputError where it cannot."""
-    path, states = trainer.checkpoint_dir.parent / SCHEDULE_FILE, {}
+    path = trainer.checkpoint_dir.parent / SCHEDULE_FILE
+    states = _read_states(path)  # a run may go on in its folder, where checkpoints of before are
 
     def write_schedule(step: int) -> None:
         if trainer.local_rank == 0 and _is_saved(trainer, step):
@@ -123,6 +124,14 @@ def sampler_writer(trainer: Any, sampler: ImportantPixels, rank: int) -> Callabl
             written.pop(0).unlink(missing_ok=True)
 
     return write_sampler
+
+
+def _read_states(path: Path) -> dict[str, Any]:
+    """The states in a schedule's file, by step; none, where it cannot be read."""
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 def _is_saved(trainer: Any, step: int) -> bool:

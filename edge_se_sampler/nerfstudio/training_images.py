@@ -6,13 +6,15 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
 
 from edge_se_sampler.data.cameras import Cameras
 from edge_se_sampler.data.lens import Intrinsics, Lens, find_pinhole, find_sources, undistort
@@ -23,15 +25,15 @@ REMEDY = "undistort the images first (COLMAP's image_undistorter), or take anoth
 
 
 class TrainingImages(InputDataset):
-    """nerfstudio's images, their alpha not composited on a color, their lens distortion undone: so a silhouette's
-    projection is right, and rays need no search for where a lens bent them.
+    """nerfstudio's images, their lens distortion undone: so a silhouette's projection is right, and rays need no search
+    for where a lens bent them. Among RGBA images RGB ones get opaque alpha.
 
     Raises:
         InputError: a camera that is no perspective one, or distorts by a fourth radial coefficient.
     """
 
     def __init__(self, dataparser_outputs: Any, scale_factor: float = 1.0) -> None:
-        super().__init__(replace(dataparser_outputs, alpha_color=None), scale_factor)
+        super().__init__(dataparser_outputs, scale_factor)
         self.mask_color = None  # it would be painted where nothing is trained on
         self.hit_pixels: list[np.ndarray] | None = None
         """(H, W) bool of each image: the pixels that are worth training on; others count as masked."""
@@ -45,7 +47,18 @@ class TrainingImages(InputDataset):
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """(H, W, 3|4) uint8, alpha straight."""
-        return self._undistort(super().get_numpy_image(image_idx), image_idx)
+        image = super().get_numpy_image(image_idx)
+        if self._some_have_alpha and image.shape[2] == 3:
+            image = np.concatenate((image, np.full_like(image[:, :, :1], 255)), axis=2)
+        return self._undistort(image, image_idx)
+
+    @cached_property
+    def _some_have_alpha(self) -> bool:
+        return any(_has_alpha(path) for path in self.image_filenames)
+
+    def keep_alpha(self) -> None:
+        """From now on give images with their alpha, as training wants them, instead of composited on a color."""
+        self._dataparser_outputs = replace(self._dataparser_outputs, alpha_color=None)
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Any]:
         """The mask, if there is one, as a pinhole would have seen it: where all of a pixel may be trained on."""
@@ -90,6 +103,11 @@ class TrainingImages(InputDataset):
 @lru_cache(maxsize=4)
 def _sources(camera: Intrinsics, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     return find_sources(camera, find_pinhole(camera, width, height), width, height)
+
+
+def _has_alpha(path: Path) -> bool:
+    with Image.open(path) as image:
+        return image.mode == "RGBA"
 
 
 def _read_lenses(cameras: Any) -> list[Intrinsics]:

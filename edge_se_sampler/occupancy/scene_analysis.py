@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,30 +80,32 @@ def analyze_scene(
     """
     box = find_box(views, near, far)
     finest = voxel_size_px * box.pixel_footprint
-    silhouettes = find_silhouettes(views) if by_alpha else {}
-    hull, max_level = _carve_initial(views, silhouettes, box, finest)
+    near_views, indices = views.leave_out_far(), views.find_near()
+    silhouettes = find_silhouettes(near_views) if by_alpha else {}
+    hull, max_level = _carve_initial(near_views, silhouettes, box, finest)
     hit_pixels = [] if hull is None else find_hit_pixels(views, hull)
-    if silhouettes and (hull is None or _missed_fraction(views, silhouettes, hit_pixels) > MAX_MISSED_FRACTION):
+    carved_by = [indices[i] for i in silhouettes]
+    if silhouettes and (hull is None or _missed_fraction(views, carved_by, hit_pixels) > MAX_MISSED_FRACTION):
         _warn_of_masks(near, far)
         silhouettes = {}
-        hull, max_level = _carve_initial(views, {}, box, finest)
+        hull, max_level = _carve_initial(near_views, {}, box, finest)
         hit_pixels = [] if hull is None else find_hit_pixels(views, hull)
     if hull is None:
         raise _nothing_seen(box)
-    num_pixels = sum(_count_shown(views, i, bool(silhouettes)) for i in range(len(views.images)))
-    cameras = views.leave_out_far().cameras
-    point, _ = find_focus(cameras)
-    focus = np.array([*point, near_share, cameras.find_distances(point).max()])
+    num_pixels = sum(int(_find_shown(views, i, bool(silhouettes)).sum()) for i in range(len(views.images)))
+    point, _ = find_focus(near_views.cameras)
+    focus = np.array([*point, near_share, near_views.cameras.find_distances(point).max()])
     return SceneAnalysis(
         box, len(silhouettes), show_whole_object(silhouettes), hull, max_level, hit_pixels, num_pixels, focus
     )
 
 
-def _count_shown(views: Views, view: int, by_alpha: bool) -> int:
-    """Pixels of a view that are trained on and show something: where alpha tells, those that are not transparent."""
+def _find_shown(views: Views, view: int, by_alpha: bool) -> np.ndarray:
+    """(H, W) bool: the pixels of a view that are trained on and show something: where alpha tells, those that are not
+    transparent."""
     image = views.images[view]
     shown = np.ones(image.shape[:2], dtype=bool) if views.masks is None else views.masks[view]
-    return int(np.count_nonzero(shown & _foreground(image) if by_alpha and image.shape[2] == 4 else shown))
+    return shown & (image[..., 3] > 0) if by_alpha and image.shape[2] == 4 else shown
 
 
 def _carve_initial(
@@ -115,16 +116,11 @@ def _carve_initial(
     return hull, MIN_LEVELS if hull is None else round(math.log2(hull.cell_size / finest))
 
 
-def _missed_fraction(views: Views, silhouettes: Mapping[int, Silhouette], hit_pixels: list[np.ndarray]) -> float:
-    """Share of the foreground's pixels whose rays miss the hull."""
-    foreground = {i: _foreground(views.images[i]) for i in silhouettes}
-    missed = sum(np.count_nonzero(mask & ~hit_pixels[i]) for i, mask in foreground.items())
-    return missed / sum(np.count_nonzero(mask) for mask in foreground.values())
-
-
-def _foreground(image: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels of an image (H, W, 4) that are not transparent."""
-    return image[..., 3] > 0
+def _missed_fraction(views: Views, carved_by: list[int], hit_pixels: list[np.ndarray]) -> float:
+    """Share of the foreground's pixels, of the views that carved the hull, whose rays miss it."""
+    foreground = {i: _find_shown(views, i, by_alpha=True) for i in carved_by}
+    missed = sum(np.count_nonzero(shown & ~hit_pixels[i]) for i, shown in foreground.items())
+    return missed / max(sum(map(np.count_nonzero, foreground.values())), 1)
 
 
 def _warn_of_masks(near: float, far: float) -> None:

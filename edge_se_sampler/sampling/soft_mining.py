@@ -5,9 +5,9 @@ q   error at a pixel, which its density shall be proportional to
 x   a walker's position as a share of its image's rows and columns
 
 A step's pixels are those that walkers stand on. First they move, by Langevin's step: x += b^2/2 grad(log q) + b N(0, 1)
-with b = 0.02. Then a tenth, always the same walkers, is drawn anew uniformly; the tenth with the smallest errors, and
-who left the image, from Sobel edges. The loss is weighted by q^-r, but at most by the weights' mean + standard
-deviation; r = min(step / 1000, alpha), alpha being `soft_mining_alpha`.
+with b = 0.02. Then a tenth, always the same walkers, is drawn anew uniformly, but the tenth with the smallest errors
+(and all whose error is as small), and who left the image, from Sobel edges. The loss is weighted by q^-r, but at most
+by the weights' mean + standard deviation; r = min(step / 1000, alpha), alpha being `soft_mining_alpha`.
 
 Decided here, for a sampler sees errors and no gradients: q is the root of the mean squared error of the channels (the
 code weights by the mean absolute one); grad(log q) is the central difference in a map, 64 x 64 cells an image, each the

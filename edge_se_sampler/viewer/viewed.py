@@ -19,7 +19,7 @@ from edge_se_sampler.engine.files import to_uint8
 from edge_se_sampler.engine.metrics import composite_on
 from edge_se_sampler.engine.pipeline import Pipeline, build_model, load_weights, saved_grid
 from edge_se_sampler.engine.run_folder import RunFolder
-from edge_se_sampler.engine.saved_state import load_sampler
+from edge_se_sampler.engine.saved_state import load_plan, load_sampler
 from edge_se_sampler.engine.session import choose_device, load_state, read_train_views
 from edge_se_sampler.engine.show import probability_map
 from edge_se_sampler.engine.trainer import Trainer
@@ -94,10 +94,12 @@ class Viewed:
             self._take(state, model)
 
     def _take(self, state: dict[str, Any], model: Any) -> None:
-        """Show a checkpoint's model, and its sampler."""
+        """Show a checkpoint's model, and its sampler, which remembers nothing of images that have changed since."""
         trainer, manager = self.trainer, self.trainer.pipeline.datamanager
         with self.turns:
-            load_sampler(manager, state["sampler"])
+            if trainer.pipeline.has_data_of(state):
+                load_sampler(manager, state["sampler"])
+            load_plan(trainer.plan, state["plan"])
             trainer.pipeline, trainer.next_step = replace(trainer.pipeline, model=model), state["step"] + 1
             if isinstance(manager.train_pixel_sampler, ImportantPixels):
                 manager.train_pixel_sampler.set_step(state["step"])
@@ -150,7 +152,8 @@ class Viewed:
             errors = squared_error() if errors is None else errors
             if errors is None:
                 return None
-            p = p * error_ranks(errors.ravel(), stream(0, 0, Stream.SELECTION)).reshape(p.shape)
+            drawn = p > 0  # candidates are no others
+            p[drawn] *= error_ranks(errors[drawn], stream(0, 0, Stream.SELECTION))
         return p * p.size / max(p.sum(), 1e-30)
 
     def _cached_errors(self, selector: RankedError, batch: ImageBatch, k: int) -> np.ndarray | None:

@@ -99,6 +99,10 @@ def test_a_resumed_run_continues_with_the_saved_schedule(host_scene: Path, tmp_p
     again.load_dir, again.timestamp = trainer.checkpoint_dir, "resumed"
     resumed = trainer_of(again)
     assert resumed.pipeline.datamanager.train_pixel_sampler.schedule.state_dict() == states[str(PLANNED - 1)]
+    again.timestamp = config.timestamp  # in its own folder, where the checkpoint that it began with stays
+    again.max_num_iterations = 2
+    trainer_of(again).train()
+    assert json.loads(saved.read_text())[str(PLANNED - 1)] == states[str(PLANNED - 1)]
 
 
 def test_a_dead_model_is_reported_once(host_scene: Path, tmp_path: Path, capfd: Any) -> None:

@@ -96,6 +96,22 @@ def test_it_trains_on_alpha_and_on_pixels_that_see_a_cell(trained: Any) -> None:
     assert trained.pipeline.datamanager.eval_dataset[0]["image"].shape[-1] == 3
 
 
+def test_a_ray_is_rendered_alike_however_many_there_are(trained: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hosts give as many as they like: of thousands at once, plain torch would take gigabytes."""
+    pipeline = trained.pipeline
+    pipeline.eval()
+    rays = pipeline.datamanager.eval_dataset.cameras[:1].generate_rays(0).flatten()
+    whole, sizes = pipeline.model.get_outputs(rays), []
+    field = type(pipeline.model.field)
+    render = field.render
+    monkeypatch.setattr(field, "rays_per_chunk", property(lambda _: 500))
+    monkeypatch.setattr(field, "render", lambda self, some: (sizes.append(len(some)), render(self, some))[1])
+    parts = pipeline.model.get_outputs(rays)
+    assert max(sizes) == 500
+    for name in ("rgb", "accumulation", "depth"):
+        torch.testing.assert_close(parts[name], whole[name], rtol=0, atol=1e-5)
+
+
 def test_images_that_are_not_kept_are_trained_on_where_pixels_see_a_cell_too(
     trained: Any, scene: Path, tmp_path: Path
 ) -> None:

@@ -38,7 +38,9 @@ def capture(folder: Path, distortion: Distortion) -> Any:
 def test_a_lens_is_undone_as_nerfstudios_rays_bend(tmp_path: Path) -> None:
     """What a pinhole shows at a pixel is what nerfstudio's ray, through that pixel of the image as it was, meets."""
     outputs = capture(tmp_path, OPENCV)
-    views = TrainingImages(outputs).read_views()
+    images = TrainingImages(outputs)
+    images.keep_alpha()
+    views = images.read_views()
     image = views.images[1].astype(np.float64)
     rows, columns = slice(4, -4), slice(4, -4)
     coords = torch.from_numpy(np.stack((image[..., 1] / ROW_STEP, image[..., 0] / COLUMN_STEP), axis=2)).float() + 0.5
@@ -66,3 +68,19 @@ def test_a_lens_is_undone_as_nerfstudios_rays_bend(tmp_path: Path) -> None:
 def test_lenses_that_it_cannot_undo_are_refused(distortion: Distortion, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         TrainingImages(capture(tmp_path, distortion))
+
+
+def test_rgb_images_among_rgba_ones_are_opaque_and_all_are_composited_where_they_are_looked_at(tmp_path: Path) -> None:
+    document = write_transforms(tmp_path)
+    colors = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
+    clear = np.dstack((colors, np.zeros((HEIGHT, WIDTH), np.uint8)))
+    for frame, image in zip(document["frames"], (colors, clear), strict=False):
+        iio.imwrite(tmp_path / frame["file_path"], image)
+    parser = NerfstudioDataParserConfig(data=tmp_path, downscale_factor=1, eval_mode="all").setup()
+    outputs = parser.get_dataparser_outputs("train")
+    outputs.alpha_color = torch.ones(3)
+    images = TrainingImages(outputs)
+    assert [images[i]["image"].mean().item() for i in range(2)] == pytest.approx([200 / 255, 1.0])
+    images.keep_alpha()
+    assert {images[i]["image"].shape[2] for i in range(len(images))} == {4}
+    assert [images[i]["image"][..., 3].mean().item() for i in range(2)] == [1, 0]
