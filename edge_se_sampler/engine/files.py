@@ -88,11 +88,16 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an image as PNG: (H, W, 3) floats in [0, 1], or (H, W) or (H, W, 3|4) of unsigned integers."""
+    """Write an image as PNG, see `encode_png`."""
+    write_atomically(path, encode_png(image))
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """(H, W, 3) floats in [0, 1], or (H, W) or (H, W, 3|4) of unsigned integers, as a PNG."""
     import imageio.v3 as iio  # slow to load: not for --help
 
     pixels = image if image.dtype.kind == "u" else to_uint8(image)
-    write_atomically(path, iio.imwrite("<bytes>", pixels, extension=".png"))
+    return iio.imwrite("<bytes>", pixels, extension=".png")
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

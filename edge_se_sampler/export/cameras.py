@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from edge_se_sampler.data.frames import DYNAMIC_MASK, Frame, read_mask
 from edge_se_sampler.data.scene_file import SourceFile, read_json
 from edge_se_sampler.data.transforms import transforms_path
 from edge_se_sampler.engine.config import TrainerConfig
-from edge_se_sampler.engine.files import check_output, make_folder, write_atomically, write_json
+from edge_se_sampler.engine.files import check_output, encode_png, make_folder, write_atomically, write_json
 from edge_se_sampler.engine.session import check_run_data, select_views
 from edge_se_sampler.errors import InputError
 
@@ -111,7 +110,7 @@ def _rewrite_masks(listed: dict[Path, Frame], entries: dict[Path, dict[str, Any]
             continue
         known = read_mask(frame.mask, np.broadcast_to(np.uint8(0), (frame.header.height, frame.header.width))) > 0
         name = f"{path.stem}-masks/{relative_path(image, Path(root))}.png"
-        files[name] = _encode(np.where(known, np.uint8(255), np.uint8(0)))
+        files[name] = encode_png(np.where(known, np.uint8(255), np.uint8(0)))
         entries[image]["mask_path"] = name
     return files
 
@@ -122,15 +121,8 @@ def _mask_all(frames: list[dict[str, Any]]) -> dict[str, bytes]:
     without, files = [frame for frame in frames if "mask_path" not in frame], {}
     for frame in without if len(without) < len(frames) else []:
         name = frame["mask_path"] = f"all-known-{frame['w']}x{frame['h']}.png"
-        files[name] = files.get(name) or _encode(np.full((frame["h"], frame["w"]), 255, np.uint8))
+        files[name] = files.get(name) or encode_png(np.full((frame["h"], frame["w"]), 255, np.uint8))
     return files
-
-
-def _encode(mask: np.ndarray) -> bytes:
-    """A PNG."""
-    file = io.BytesIO()
-    Image.fromarray(mask).save(file, "PNG")
-    return file.getvalue()
 
 
 def _is_plain(mask: SourceFile) -> bool:

@@ -80,7 +80,8 @@ def analyze_scene(
     """
     box = find_box(views, near, far)
     finest = voxel_size_px * box.pixel_footprint
-    near_views, indices = views.leave_out_far(), views.find_near()
+    indices = views.find_near()
+    near_views = views.subset(indices)
     silhouettes = find_silhouettes(near_views) if by_alpha else {}
     hull, max_level = _carve_initial(near_views, silhouettes, box, finest)
     hit_pixels = [] if hull is None else find_hit_pixels(views, hull)
